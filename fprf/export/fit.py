@@ -19,7 +19,7 @@ from ..scenes import Scene
 from ..splats.config import GaussiansConfig
 from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
-from ..splats.learner import GaussianLearner
+from ..splats.learner import Bounds, GaussianLearner, Stage
 from ..splats.photographs import make_levels
 from ..splats.setup import find_near, scene_scale
 from ..style.look import Restyle
@@ -85,7 +85,7 @@ def fit_gaussians(
     points = seen_points(maps, max(1, round(_BEGIN * cap)))
     near = find_near(parsed, points)
     config = GaussiansConfig(cap=cap, background=background or (0.0, 0.0, 0.0))
-    scale = scene_scale(parsed)
+    bounds = Bounds(room=cap, scene_scale=scene_scale(parsed))
     learner = None
     for number, look in enumerate(looks):
         shown = scene.restyled(look)
@@ -97,12 +97,13 @@ def fit_gaussians(
         # The first look decides the geometry; in further ones the same Gaussians learn their colours at full
         # size.
         if learner is None:
-            learner = GaussianLearner(config, levels, scale, cap)
+            learner = GaussianLearner(config, levels, bounds)
             learner.begin_at(points, draw)
             seconds = 60 * minutes
         else:
             before = learner
-            learner = GaussianLearner(replace(config, coarse=0.0), levels, scale, cap, only="colours")
+            colours = Stage(only="colours")
+            learner = GaussianLearner(replace(config, coarse=0.0), levels, bounds, stage=colours)
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
         what = "fitting Gaussians" if number == 0 else "fitting colours"

@@ -42,39 +42,49 @@ from ..training.run import Run, known_of
 from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, train_all
 from ..types import Cell
 from .config import GaussiansConfig
-from .gaussians import Gaussians, from_tensors, tensors_of
+from .gaussians import Gaussians, from_tensors, joined, tensors_of
 from .initial import curve_order
-from .learner import CPU, MOVES, GaussianLearner, Stage, left_out, refined
+from .learner import CPU, Bounds, GaussianLearner, Source, Stage, left_out, refined
 from .levels import in_view
 from .photographs import covering, load_photographs, make_levels
 from .setup import build, light_and_poses, limit_widths, scene_scale
+from .view_corrections import MOVES, ViewCorrections
 
-Number = TypeVar("Number", bound=np.generic)
-_FORMAT = 6
+Element = TypeVar("Element", bound=np.generic)
+_CELL_VERSION = 6
 """Version of how a cell is trained: another one trains it anew."""
-_MOMENTS = "first", "second", "weight"
-_PIXELS = 16_000_000
-_SMALLEST = 4
-"""Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some
-are left out.
+_MOMENTS = ("first", "second", "weight")
+"""Names in checkpoints of Adam's moments, and of the weights in the second."""
+_MAX_OVERVIEW_PIXELS = 16_000_000
+"""Pixels of all photographs that the whole scene is trained on, at most: bounds its memory, 1.6 GiB for 16
+towns (district.json).
 """
-_RATE = 0.5
+_MAX_OVERVIEW_REDUCTION = 4
+"""How far photographs are reduced before some are left out; by eye."""
+_CELL_RATE = 0.5
 """Factor of the learning rates in cells, whose windows are seen more often than the photographs of the whole
-scene.
+scene; by eye.
 """
-_VISITS = 10
-"""Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up
-for fewer.
+_MIN_OVERVIEW_PASSES = 10
+"""Times that the whole scene sees each photograph, at least, however few `steps` there are: cells do not make
+up for fewer; by eye.
 """
-_DEVIATIONS = 3.0
-"""A Gaussian is shown as far as so many standard deviations from its mean."""
-_RUN = 256
-_LOOKED = 40
-_COARSER = 4
-_WEIGHT = 0.003
-"""Gaussians that are looked for together; windows that are drawn to see what they show, at most, evenly over
-all; the part of their size at which they are; the least that the weights of a Gaussian in all pixels of one
-sum to.
+_MAX_PASSED_SHARE = 0.99
+"""Share of the growth that is taken to be over when a cell begins, at most: at 1 it would have no beginning."""
+
+# Which Gaussians the windows of a cell show.
+
+_SHOWN_DEVIATIONS = 3.0
+"""A Gaussian is shown as far as so many standard deviations from its mean: 98.9 % of its weight."""
+_RUN_LENGTH = 256
+"""Gaussians, near to each other, that are looked for together; by eye."""
+_MAX_DRAWN_WINDOWS = 40
+"""Windows that are drawn to see what they show, at most, evenly over all; by eye."""
+_WINDOW_REDUCTION = 4
+"""How far the windows are reduced for that; by eye."""
+_MIN_SHOWN_WEIGHT = 0.003
+"""Sum of the weights of a Gaussian in all pixels of a window from which on it is shown; by eye: below a 256th
+of a pixel.
 """
 
 
@@ -223,29 +233,32 @@ class CellPart(Part):
         around = int(cell.around(gaussians.means).sum())
         cap = len(gaussians) + round(max(config.most - len(whole), 0) * around / len(whole))
         tones = overview_tones(self.facts, start)
+        if tones is not None:
+            tones = tones.going_on(other_views(scene, cell.windows))
         device = device_of(config.device)
         learner = GaussianLearner(
-            replace(config, cap=cap, rate=_RATE * config.rate),
+            replace(config, cap=cap, rate=_CELL_RATE * config.rate),
             make_levels(own, images, masks, near, skies, device=device),
-            scene_scale(own),
-            cap,
-            cell.around,
-            # Of all cameras: what lies before those of other cells is part of the union.
-            limit_widths(scene, near, cells=True),
-            near=near,
-            tones=tones and tones.going_on(other_views(scene, cell.windows)),
-            stage=Stage(start.step, config.overview, 1.0),
-            known=known_of(own, config.data, self.facts),
-            origin="the whole scene",
+            Bounds(
+                room=cap,
+                scene_scale=scene_scale(own),
+                near=near,
+                inside=cell.around,
+                # Of all cameras: what lies before those of other cells is part of the union.
+                limit_widths=limit_widths(scene, near, cells=True),
+            ),
+            corrections=ViewCorrections(tones),
+            stage=Stage(before=start.step, first=config.overview),
+            source=Source(known=known_of(own, config.data, self.facts), points="the whole scene"),
             device=device,
         )
         # Their moments go on, and their number grows as if it had from the beginning of the schedule.
-        passed = min(config.overview / config.grow, 0.99)
+        passed = min(config.overview / config.grow, _MAX_PASSED_SHARE)
         begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
         moments = {}
         for name in _MOMENTS:
             moments[name] = start.optimizer[name][shown]
-        learner.load(State(vars(gaussians), {**moments, "begun": torch.tensor(begun)}))
+        learner.load(State(gaussians.tensors, {**moments, "begun": torch.tensor(begun)}))
         return learner
 
 
@@ -271,7 +284,9 @@ def open_cell(task: Task) -> Overview | CellPart:
             folder=folder,
             # What is finished stays when a run is gone on with for more steps or minutes.
             asked={
-                "task": digest_of(config, free, scene, scene.train.tolist(), {"format": _FORMAT, "start": ""})
+                "task": digest_of(
+                    config, free, scene, scene.train.tolist(), {"format": _CELL_VERSION, "start": ""}
+                )
             },
             schedule=Schedule(own.most_steps, task.minutes, config.checkpoint_minutes),
             config=own,
@@ -280,7 +295,7 @@ def open_cell(task: Task) -> Overview | CellPart:
         )
     cell = load_cells(root)[number]
     parts = {
-        "format": _FORMAT,
+        "format": _CELL_VERSION,
         "start": checkpoint.digest(folder_of(root, WHOLE) / "checkpoints"),
         "bounds": [each.tolist() for each in (cell.frame, cell.low, cell.high, cell.border)],
         "windows": sorted(cell.windows.items()),
@@ -309,9 +324,9 @@ def overview_config(config: GaussiansConfig, scene: ParsedScene) -> tuple[Gaussi
     # photograph ...
     pixels = int(scene.cameras.size[scene.train].prod(1).sum())
     factor = 2
-    while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
+    while factor < _MAX_OVERVIEW_REDUCTION and pixels > factor**2 * _MAX_OVERVIEW_PIXELS:
         factor += 1
-    every = -(-pixels // (factor**2 * _PIXELS))
+    every = -(-pixels // (factor**2 * _MAX_OVERVIEW_PIXELS))
     own = replace(
         config,
         downscale=factor * (config.downscale or 1),
@@ -319,7 +334,9 @@ def overview_config(config: GaussiansConfig, scene: ParsedScene) -> tuple[Gaussi
         coarse=min(1.0, config.coarse / config.overview / 3 ** math.log2(factor)),
         # As many as one piece would have by then.
         cap=round(config.initial * (config.most / config.initial) ** min(1.0, config.overview / config.grow)),
-        steps=max(1, round(config.overview * config.most_steps), _VISITS * len(scene.train[::every])),
+        steps=max(
+            1, round(config.overview * config.most_steps), _MIN_OVERVIEW_PASSES * len(scene.train[::every])
+        ),
     )
     return own, every
 
@@ -340,7 +357,7 @@ def scene_in_windows(scene: ParsedScene, cell: Cell) -> ParsedScene:
     return replace(scene, cameras=replace(scene.cameras, centre=centre, size=size), train=views)
 
 
-def crop(cell: Cell, images: dict[int, NDArray[Number]]) -> dict[int, NDArray[Number]]:
+def crop(cell: Cell, images: dict[int, NDArray[Element]]) -> dict[int, NDArray[Element]]:
     """A cell's windows of images [H W ...] by view."""
     cropped = {}
     for view, image in images.items():
@@ -361,27 +378,29 @@ def shown_in_windows(
     # Runs [B R] of Gaussians near to each other, the last one repeated, with balls around what they show:
     # most windows show few of them.
     order = torch.from_numpy(curve_order(gaussians.means.double().numpy()))
-    order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
+    order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN_LENGTH), mode="replicate").view(
+        -1, _RUN_LENGTH
+    )
     means = gaussians.means[order]
     quaternions = gaussians.quaternions[order]
     log_scales = gaussians.log_scales[order]
     centre = (means.double().amin(1) + means.double().amax(1)) / 2
-    reach = _DEVIATIONS * log_scales.amax(2).double().exp()
+    reach = _SHOWN_DEVIATIONS * log_scales.amax(2).double().exp()
     radius = ((means.double() - centre[:, None]).norm(dim=2) + reach).amax(1)
     logits = gaussians.logits[order]
     logits.view(-1)[len(gaussians) :] = -math.inf  # the repeated ones
     # Draw the runs in view of each window, coarsely, and keep what weighs anything there.
     shown = torch.zeros(order.shape, dtype=torch.bool)
     views = list(cell.windows)
-    for view in views[:: -(-len(views) // _LOOKED)]:
-        camera = covering(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)
+    for view in views[:: -(-len(views) // _MAX_DRAWN_WINDOWS)]:
+        camera = covering(cameras.select(torch.tensor([view])).scaled(_WINDOW_REDUCTION), 0, near)
         runs = torch.from_numpy(in_view(camera, centre.numpy(), radius.numpy())[1]).nonzero()[:, 0]
         mean = means[runs].flatten(0, 1)
         quaternion = quaternions[runs].flatten(0, 1)
         log_scale = log_scales[runs].flatten(0, 1)
         ones = torch.ones(camera.height, camera.width, 1)
         weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, ones, antialiased=True)
-        shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
+        shown[runs] |= weights.view(-1, _RUN_LENGTH) > _MIN_SHOWN_WEIGHT
     visible[order[shown]] = True
     return visible
 
@@ -390,8 +409,8 @@ def overview_tones(facts: Facts, start: checkpoint.Saved) -> Tones | None:
     """The exposures that cells go on from; None where none are learnt."""
     if "tones.gain.value" not in start.optimizer:
         return None
-    gain = start.optimizer[f"tones.{'gain'}.value"]
-    exponent = start.optimizer[f"tones.{'exponent'}.value"]
+    gain = start.optimizer["tones.gain.value"]
+    exponent = start.optimizer["tones.exponent.value"]
     never = (gain == 0).all(1).nonzero()[:, 0]  # views that only cells learn from
     tones = Tones(torch.tensor(facts.exposure), tuple(never.tolist()))
     tones.load_state_dict({"gain": gain, "exponent": exponent})
@@ -407,7 +426,7 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
     start = load_overview(root)
     # Exposures are averaged over cells as factors: of each view, those of the cells that have a window of it.
     tones = overview_tones(Run(root).load_known().facts, start)
-    parts: list[tuple[Tensor, ...]] = []
+    parts: list[Gaussians] = []
     step = start.step
     seconds = start.seconds
     gain = torch.zeros(0)
@@ -424,16 +443,14 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
             )
         # What lies outside of the cell only explained what its windows show: its own cells know it better.
         gaussians = from_tensors(saved.model)
-        own_part = gaussians.select(held_apart(cells, number, gaussians.means))
-        parts.append(tuple(vars(own_part).values()))
+        parts.append(gaussians.select(held_apart(cells, number, gaussians.means)))
         step = max(step, start.step + saved.step)
         seconds = seconds + saved.seconds
         if tones is not None:
             used = list(cell.windows)
             own = tones.going_on(tuple(sorted(set(range(len(gain))) - set(used))))
-            own.load_state_dict(
-                {name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")}
-            )
+            learnt = {name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")}
+            own.load_state_dict(learnt)
             gain[used] += own.gains().detach()[used]
             count[used] += 1
     # What no cell holds is as the whole scene has it.
@@ -442,9 +459,9 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
     for cell in cells:
         held |= cell.holds(around.means)
     if not bool(held.all()):
-        parts.append(tuple(vars(around.select(~held)).values()))
+        parts.append(around.select(~held))
     # Poses were refined in the whole scene alone.
-    gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    gaussians = joined(parts)
     corrections = {}
     for name, each in start.optimizer.items():
         if name == MOVES:

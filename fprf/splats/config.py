@@ -22,10 +22,14 @@ if TYPE_CHECKING:
     from ..scenes import Partition, SceneLearner
     from ..training.facts import Facts
 
-_CAP = 60_000
-_PASSES = 280
-_STEPS = 10_000
-_NO_END = 100_000
+_DEFAULT_CAP = 60_000
+"""Gaussians where neither the user nor a plan says how many: those of a minute (`plan`)."""
+_DEFAULT_PASSES = 280
+"""Passes over the photographs where neither says how many; by eye, for photographs of 640 x 360 pixels."""
+_DEFAULT_STEPS = 10_000
+"""Steps where neither they nor minutes are given; by eye."""
+_MAX_TIMED_STEPS = 100_000
+"""Steps where minutes are given: more than there is time for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,12 +219,12 @@ class GaussiansConfig(RunConfig):
     @property
     def most(self) -> int:
         """`cap`; where neither the user nor a plan has said it, 60 000."""
-        return self.cap or _CAP
+        return self.cap or _DEFAULT_CAP
 
     @property
     def most_passes(self) -> int:
         """`passes`; where neither the user nor a plan has said it, 280."""
-        return self.passes or _PASSES
+        return self.passes or _DEFAULT_PASSES
 
     @property
     def most_steps(self) -> int:
@@ -228,8 +232,8 @@ class GaussiansConfig(RunConfig):
         if self.steps is not None:
             return self.steps
         if self.minutes is None:
-            return _STEPS
-        return _NO_END
+            return _DEFAULT_STEPS
+        return _MAX_TIMED_STEPS
 
     @property
     def trained_on(self) -> str:

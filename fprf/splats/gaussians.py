@@ -5,7 +5,7 @@ harmonics_k), sRGB, with the real spherical harmonics Y of `ops.harmonics`.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, NamedTuple
 
@@ -20,14 +20,20 @@ from ..ops.rasterise.training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATER
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
-_LARGEST = 1e15
-_WIDEST = 88.0
-_FLATTEST = -30.0
-"""Magnitude from which on nothing is drawn (`ops.rasterise.reference`); ln-scales: the largest whose size is
-finite in float32, and the smallest that drawing tells from 0.
+_MAX_MAGNITUDE = 1e15
+"""Magnitude from which on nothing is drawn (`ops.rasterise.reference`)."""
+_MAX_LOG_SCALE = 88.0
+"""Largest ln-scale whose size is finite in float32: exp(88.7) is its largest number."""
+_MIN_LOG_SCALE = -30.0
+"""Smallest ln-scale that drawing tells from 0 (`ops.rasterise.reference`)."""
+_MIN_QUATERNION = 1e-12
+"""Magnitude of a quaternion's largest component below which there is no rotation: its square, in float32, is
+far above 0.
 """
-_SAMPLE = 100_000
-"""Points, about, of which quantiles are taken."""
+_CHECKED_ROWS = 1 << 20
+"""Gaussians whose magnitudes are taken together: those of all would take as much memory as these."""
+_MAX_BULK_POINTS = 100_000
+"""Points, about, of which the bulk is found; by eye: percentiles of so many are good to a tenth of one."""
 MAX_BULK_DISTANCE = 128.0
 """Distance from the bulk (`Bulk.apart`) beyond which Gaussians are stray; by eye."""
 
@@ -92,6 +98,11 @@ class Gaussians:
         return torch.cat([*parts, self.harmonics.flatten(1)], 1)
 
     @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All parameters by their names."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
     def finite(self) -> Annotated[Tensor, "N"]:
         """Gaussians that can be drawn, bool: with finite numbers below 1e15 and rotations of a length above
         0.
@@ -105,12 +116,11 @@ class Gaussians:
     def _sound(self) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
         """Masks of the Gaussians whose numbers are within bounds, and of those that have a rotation."""
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
-        # A million rows at a time: magnitudes of all harmonics would take as much memory as these.
-        small = torch.stack([
-            torch.cat([(rows.abs() < _LARGEST).all(1) for rows in torch.split(part, 1 << 20)]) for part in parts
-        ]).all(0)  # fmt: skip
-        sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
-        return small & sized & ~self.logits.isnan(), (self.quaternions.abs() >= 1e-12).any(1)
+        bounded = (self.log_scales <= _MAX_LOG_SCALE).all(1) & ~self.logits.isnan()  # False for NaN
+        for part in parts:
+            small = [(rows.abs() < _MAX_MAGNITUDE).all(1) for rows in torch.split(part, _CHECKED_ROWS)]
+            bounded = bounded & torch.cat(small)
+        return bounded, (self.quaternions.abs() >= _MIN_QUATERNION).any(1)
 
     def faults(self) -> list[str]:
         """How many Gaussians cannot be drawn, for each reason: "3 that are not finite"."""
@@ -128,7 +138,7 @@ class Gaussians:
         """
         finite = self.finite
         kept = self if bool(finite.all()) else self.select(finite)
-        return replace(kept, log_scales=kept.log_scales.clamp_min(_FLATTEST))
+        return replace(kept, log_scales=kept.log_scales.clamp_min(_MIN_LOG_SCALE))
 
     def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "Gaussians":
         """The same Gaussians with other harmonics."""
@@ -136,13 +146,13 @@ class Gaussians:
 
     def to(self, device: torch.device) -> "Gaussians":
         """The same Gaussians on a device."""
-        return Gaussians(*(part.to(device) for part in vars(self).values()))
+        return Gaussians(**{name: part.to(device) for name, part in self.tensors.items()})
 
     def select(self, index: Annotated[Tensor, "M"] | slice) -> "Gaussians":
         """Some of the Gaussians, in the order of `index` (int64, or a mask of all); without a copy those of a
         slice.
         """
-        return Gaussians(*(part[index] for part in vars(self).values()))
+        return Gaussians(**{name: part[index] for name, part in self.tensors.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +184,17 @@ def from_rows(rows: Annotated[Tensor, "N R"]) -> Gaussians:
     return Gaussians(*(part.contiguous() for part in parts))
 
 
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of some, one after the other."""
+    tensors = {}
+    for field in fields(Gaussians):
+        tensors[field.name] = torch.cat([getattr(part, field.name) for part in parts])
+    return Gaussians(**tensors)
+
+
 def tensors_of(gaussians: Gaussians, near: float) -> dict[str, Tensor]:
     """The tensors of a checkpoint; nothing nearer to a camera than `near` is drawn."""
-    return vars(gaussians) | {"near": torch.tensor(near, dtype=torch.float64)}
+    return gaussians.tensors | {"near": torch.tensor(near, dtype=torch.float64)}
 
 
 def from_tensors(tensors: Mapping[str, Tensor]) -> Gaussians:
@@ -201,7 +219,8 @@ def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
     if not len(points):
         return Bulk(0.0, np.zeros(0))
     # Of many points a sample says where the middle is.
-    low, high = np.percentile(points[:: max(1, len(points) // _SAMPLE)].astype(np.float64), (10, 90), axis=0)
+    some = points[:: max(1, len(points) // _MAX_BULK_POINTS)].astype(np.float64)
+    low, high = np.percentile(some, (10, 90), axis=0)
     side = float((high - low).max()) or float(np.ptp(points.astype(np.float64), axis=0).max())
     apart = np.maximum(low - points, points - high).max(1).clip(0)
     return Bulk(side, apart / (side or 1.0))

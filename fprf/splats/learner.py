@@ -22,9 +22,10 @@ parameters, Adam's moments and the step are all the state there is.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -41,150 +42,163 @@ from ..ops.rasterise.training import (
     MEANS,
     QUATERNION,
     Floats,
-    Learnt,
-    Target,
 )
 from ..rendering.cameras import Cameras
 from ..rendering.splines import rotations
 from ..scenes import SceneLearner
 from ..training import checkpoint
-from ..training.camera_optimizers import Poses, Tones, moved_cameras, rotated
+from ..training.camera_optimizers import moved_cameras
 from ..training.facts import Facts
 from ..training.run import Known, Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
 from .initial import Points, curve_order, spacing
 from .photographs import Level
+from .view_corrections import MOVES, ViewCorrections
 
 _START_OPACITY = 0.3
-_START_SCALE = 0.7
-_FAR_OPACITY = 0.9
-"""First Gaussians: opacity, standard deviation as a share of the distance to their neighbours, opacity far
-away.
+"""Opacity of the first Gaussians; by eye."""
+_START_WIDTH_SHARE = 0.7
+"""Standard deviation of the first Gaussians, as a share of the distance to their neighbours; by eye."""
+_SURROUNDINGS_OPACITY = 0.9
+"""Opacity of the first Gaussians of the surroundings; by eye: what is far hides what is behind it."""
+_LEARNING_RATES = {
+    "means": 2.5e-3,
+    "scales": 0.08,
+    "quats": 0.016,
+    "opacities": 0.1,
+    "sh0": 0.07,
+    "shN": 0.01,
+}
+"""Learning rates at the beginning, by gsplat's names, the means' in units of the scene scale. 0.6 and 1.5
+times as much come to 0.07 dB less and 0.04 dB more on garden_seattle (training_trials.json).
 """
-_RATES = {"means": 2.5e-3, "scales": 0.08, "quats": 0.016, "opacities": 0.1, "sh0": 0.07, "shN": 0.01}
-"""Learning rates at the beginning, the means' in units of the scene scale. They fall to a fifth, the means'
-to a twentieth.
+_FINAL_RATE_SHARE = 0.2
+"""What is left of these, and of the decay, at the end of the training; by eye."""
+_FINAL_MEANS_RATE_SHARE = 0.05
+"""What is left of the means' rate; by eye."""
+_HARMONICS_DECAY = 3e-3
+"""Weight decay of the harmonics above degree 0, a step. From where no photograph looks they would become any
+colour, which a style that refits cut colours brings into view as specks; by eye.
 """
-_DECAY = 3e-3
-_DECAY_EVERY = 20
-"""Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates
-do. From where no photograph looks they would become any colour, which a style that refits cut colours brings
-into view as specks.
-"""
-_GAIN_RATE = 0.005
-_EXPONENT_RATE = 2e-3
-"""Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall
-to a tenth.
-"""
-_NAMED = 3
+_DECAY_EVERY_STEPS = 20
+"""Steps between its uses, which then count as many times: it reads all Gaussians."""
+_MAX_NAMED_PHOTOGRAPHS = 3
 """Blurred photographs that are named, at most."""
-_SETTLE = 200
-_SORT_EVERY = 5
-_LAST = 0.85
-"""Steps before the first relocation; relocations between sorts; share of training after which nothing is
-moved any more.
-"""
+_MIN_RELOCATION_STEP = 200
+"""Steps before the first relocation, while the first Gaussians settle; by eye."""
+_MAX_RELOCATION_SHARE = 0.85
+"""Share of the training after which nothing is moved any more, as it would not be learnt; by eye."""
+_SORT_EVERY_RELOCATIONS = 5
+"""Relocations between sorts in memory; by eye."""
+_SORT_GROWTH_SHARE = 0.3
+"""Growth of a relocation, as a share of the Gaussians, from which on they are sorted at once; by eye."""
 _ERROR_VIEWS = 8
-"""Views whose errors say where Gaussians are split."""
-_BLURRED_EVERY = 8
+"""Views whose errors say where Gaussians are split; 16 gain nothing (training_trials.json)."""
+_BLURRED_EVERY_EPOCHS = 8
 """Epochs of which one shows blurred views too. With 8 of 29 views moved by 7 to 13 pixels llff_flower comes
 to 28.6 dB if all are shown alike, 29.1 without the eight, and 29.2 so; had none moved, to 29.7
-(benchmarks/results/blurred.json).
+(blurred.json).
 """
-_DEAD = 0.005
-"""Opacity below which a Gaussian is moved elsewhere."""
-_SKY = 0.7
-_SEEN = 1.0
-"""Share of a Gaussian's weight in sky, and its least weight in pixels of these views, from which on it is
-moved.
+_MIN_OPACITY = 0.005
+"""Opacity below which a Gaussian is moved elsewhere: that of Kerbl et al. and of 3DGS-MCMC."""
+_MAX_OPACITY = 0.995
+"""Largest opacity of a half: beyond it gradients vanish; by eye."""
+_MAX_SKY_SHARE = 0.7
+"""Share of a Gaussian's weight in sky from which on it is moved; by eye."""
+_MIN_SKY_PIXELS = 1.0
+"""Weight in pixels of the views that is taken for a Gaussian with less, so that hardly seen ones stay; by
+eye.
 """
-_SPLIT_SIZE = 0.6
-_SPLIT_DISTANCE = 0.5
-_SPLIT_OPACITY = 0.85
-"""Halves: size and distance from the middle along the longest axis, as shares of its size; share of the
-opacity.
-"""
-_SMOOTHING = 0.95
-"""Decay of running means."""
+_HALF_WIDTH_SHARE = 0.6
+"""Size of a half along the longest axis, as a share of the Gaussian's; by eye: 1 / 1.6 in Kerbl et al."""
+_HALF_DISTANCE_SHARE = 0.5
+"""Distance of a half from the middle, as a share of the Gaussian's size; by eye."""
+_HALF_OPACITY_SHARE = 0.85
+"""Opacity of a half, as a share of the Gaussian's, since both overlap; by eye."""
+_MEANS_DECAY = 0.95
+"""Decay of running means of the losses; by eye."""
 CPU = torch.device("cpu")
-MOVES = "poses.moves"
-"""Name in checkpoints of where views were moved: `Poses.moved_by`."""
-_KEPT = "value", "first", "second", "steps"
-"""Names in checkpoints of the parameter of a correction, its moments, and the steps of each view."""
 
 LimitWidths = Callable[[Trainable, int], None]
 """Cuts standard deviations in place after a step."""
 
 
-class Stage(NamedTuple):
-    """The part of a whole schedule that a learner is given to train."""
+@dataclass(frozen=True, kw_only=True)
+class Bounds:
+    """How many Gaussians there may be, where, and how wide."""
+
+    room: int
+    """Gaussians that there is memory for."""
+    scene_scale: float
+    """Unit of the means' learning rate, in world units."""
+    near: float = 0.01
+    """Nothing nearer to a camera is drawn."""
+    inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None
+    """Mask of the means that are split or moved; None = all."""
+    limit_widths: LimitWidths | None = None
+    """Called after each step; None = no width is limited."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """The part of a whole schedule, and of the parameters, that a learner is given to train."""
 
     before: int = 0
     """Steps that its Gaussians were trained for elsewhere."""
     first: float = 0.0
+    """Share of the schedule where its training begins."""
     last: float = 1.0
-    """Shares of the schedule where its training begins and ends."""
+    """Share of the schedule where its training ends."""
+    only: Literal["colours", "poses"] | None = None
+    """Learn harmonics alone, or neither Gaussians nor factors; None = everything."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """What a run was made of."""
+
+    known: Known
+    """What scene.json will hold."""
+    points: str
+    """Where the first Gaussians come from."""
 
 
 class GaussianLearner(SceneLearner):
-    """Gaussians in training. `scene_scale` is the unit of the means' learning rate, in world units.
+    """Gaussians in training; `source` is given to learners of a run.
 
-    There is room for `room` of them. Only those whose means are `inside` are split or moved; None = all.
-    After each step `limit_widths` may cut the standard deviations; None = none is limited. Nothing nearer to
-    a camera than `near` is drawn. With `tones` each view's factors are learnt as well, with `poses` where
-    each view was taken. `only` colours learns harmonics alone, `only` poses neither Gaussians nor factors.
-    `known` is what scene.json will hold, for learners of a run; `origin` says where the first Gaussians come
-    from. On a CUDA `device` they are drawn and moved there, where gsplat can; what is decided every tenth
-    step or more rarely (widths, splits) is decided on the CPU.
+    On a CUDA `device` they are drawn and moved there, where gsplat can; what is decided every tenth step or
+    more rarely (widths, splits) is decided on the CPU.
     """
 
     def __init__(
         self,
         config: GaussiansConfig,
         levels: list[Level],
-        scene_scale: float,
-        room: int,
-        inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
-        limit_widths: LimitWidths | None = None,
+        bounds: Bounds,
         *,
-        near: float = 0.01,
-        tones: Tones | None = None,
-        poses: Poses | None = None,
-        only: Literal["colours", "poses"] | None = None,
+        corrections: ViewCorrections | None = None,
         stage: Stage | None = None,
-        known: Known | None = None,
-        origin: str = "",
+        source: Source | None = None,
         device: torch.device = CPU,
     ) -> None:
-        self.inside = inside
-        self.limit_widths = limit_widths
-        self.near = near
-        self.known = known
-        self.origin = origin
         self.config = config
         self.levels = levels
-        self.scene_scale = scene_scale
+        self.bounds = bounds
+        self.corrections = corrections or ViewCorrections()
         self.stage = stage or Stage()
-        self.bands = (config.degree + 1) ** 2
-        self.model: Trainable = trainable(room, self.bands, device)
+        self.source = source
         self.asked = device
-        self.begun = self.pixels = self.skipped = self.failed = 0
+        self.bands = (config.degree + 1) ** 2
+        self.model: Trainable = trainable(bounds.room, self.bands, device)
+        self.begun = 0
+        """Gaussians at the start."""
+        self.pixels = 0
+        self.skipped = 0
+        self.failed = 0
+        """Steps in a row whose loss was not finite."""
         self.means: dict[str, float] = {}
-        self.tones = tones
-        self.poses = poses
-        self.only = only
-        self.corrections = {
-            f"{kind}.{name}": (
-                each.detach(),
-                torch.zeros_like(each),
-                torch.zeros_like(each),
-                torch.zeros(each.shape[:1]),
-            )
-            for kind, module in (("tones", tones), ("poses", poses))
-            for name, each in (module.named_parameters() if module is not None else ())
-        }
-        """Corrections of views by name: the parameter, its moments and the steps of each view (`_KEPT`)."""
+        """Running means of the losses."""
 
     @property
     def device(self) -> torch.device:
@@ -195,8 +209,8 @@ class GaussianLearner(SceneLearner):
 
     @property
     def facts(self) -> Facts:
-        assert self.known is not None  # learners of a run have it
-        return self.known.facts
+        assert self.source is not None  # learners of a run have it
+        return self.source.known.facts
 
     def begin_at(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
         """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of
@@ -206,14 +220,14 @@ class GaussianLearner(SceneLearner):
         order = curve_order(points.position)
         position = points.position[order]
         colour = points.colour[order]
-        size = spacing(position) * _START_SCALE
+        size = spacing(position) * _START_WIDTH_SHARE
         opacity = np.full(len(position), _START_OPACITY)
         if surroundings is not None:
             far = surroundings.position
             position = np.concatenate([position, far])
             colour = np.concatenate([colour, surroundings.colour])
-            size = np.concatenate([size, spacing(far) * _START_SCALE])
-            opacity = np.concatenate([opacity, np.full(len(far), _FAR_OPACITY)])
+            size = np.concatenate([size, spacing(far) * _START_WIDTH_SHARE])
+            opacity = np.concatenate([opacity, np.full(len(far), _SURROUNDINGS_OPACITY)])
         # The same colour from everywhere: c = 0.5 + Y_0 h_0.
         harmonics = np.zeros((len(position), self.bands, 3), np.float32)
         harmonics[:, 0] = (colour - 0.5) / HARMONIC
@@ -231,16 +245,17 @@ class GaussianLearner(SceneLearner):
     def step(self, index: int, share: float) -> None:
         """Learn from one view."""
         config = self.config
+        only = self.stage.only
         step = self.stage.before + index
         share = self.stage.first + (self.stage.last - self.stage.first) * share
         # Coarse photographs first: half the size until `coarse`, a quarter until a third of that, and so on.
         level = self.levels[sum(share < config.coarse / 3**k for k in range(len(self.levels) - 1))]
         view = self._view(level, step)
-        target = self._target(level, view)
+        target = self.corrections.moved(level[view], view)
         # Render, compare, and move every Gaussian that the view shows; nothing moves where the loss is not
         # finite.
         rates = self._learning_rates(share)
-        factors = self._factors(view)
+        factors = self.corrections.factors(view)
         measured = self.model.learn(
             target, background=config.background, ssim=config.ssim, rates=rates, factors=factors
         )
@@ -250,22 +265,25 @@ class GaussianLearner(SceneLearner):
             return
         self.failed = 0
         # Colours that no view shows fall back to their mean, and what grew too wide is cut.
-        if step % _DECAY_EVERY == 0 and self.only is None:
-            self.model.multiply(slice(HARMONICS.start + 3, None), 1 - _DECAY_EVERY * _DECAY * 0.2**share)
-        if self.limit_widths is not None:
-            self.limit_widths(self.model, step)
-        self._correct_view(view, target, measured, share)
+        if step % _DECAY_EVERY_STEPS == 0 and only is None:
+            decay = _DECAY_EVERY_STEPS * _HARMONICS_DECAY * _FINAL_RATE_SHARE**share
+            self.model.multiply(slice(HARMONICS.start + 3, None), 1 - decay)
+        if self.bounds.limit_widths is not None:
+            self.bounds.limit_widths(self.model, step)
+        if only != "poses":
+            self.corrections.learn_tones(view, measured, config.rate, share)
+        self.corrections.learn_poses(view, target, measured, config.poses, share)
         # Gaussians move to where views err, but not while the first ones settle, nor so late that nothing
         # learns them.
-        due = (step + 1) % config.relocate_every == 0 and self.only is None
-        if due and step >= _SETTLE and share < max(config.grow, _LAST):
+        due = (step + 1) % config.relocate_every == 0 and only is None
+        if due and step >= _MIN_RELOCATION_STEP and share < max(config.grow, _MAX_RELOCATION_SHARE):
             self._relocate_and_grow(step, level, share)
         # Running means, which start at the first value.
         self.pixels += target.width * target.height
         if not math.isfinite(measured.squared):  # no pixel of the view counts
             return
         for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
-            self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
+            self.means[name] = _MEANS_DECAY * self.means.get(name, value) + (1 - _MEANS_DECAY) * value
 
     def _view(self, level: Level, step: int) -> int:
         """The view of a step. Each epoch sees views once, in an order of its own: sharp ones, and all in
@@ -273,8 +291,8 @@ class GaussianLearner(SceneLearner):
         """
         every = list(level)
         sharp = self._sharp(level)
-        cycle, at = divmod(step, len(every) + (_BLURRED_EVERY - 1) * len(sharp))
-        epoch = _BLURRED_EVERY * cycle
+        cycle, at = divmod(step, len(every) + (_BLURRED_EVERY_EPOCHS - 1) * len(sharp))
+        epoch = _BLURRED_EVERY_EPOCHS * cycle
         turn = at
         if at >= len(every):
             later, turn = divmod(at - len(every), len(sharp))
@@ -286,63 +304,23 @@ class GaussianLearner(SceneLearner):
         """Views that are not blurred at a scale; all where only poses or colours are learnt."""
         found: list[int] = []
         for view in level:
-            if self.only is not None or view not in level.blurred:
+            if self.stage.only is not None or view not in level.blurred:
                 found.append(view)
         return found
-
-    def _target(self, level: Level, view: int) -> Target:
-        """A photograph, taken from where its pose is now."""
-        target = level[view]
-        if self.poses is None:
-            return target
-        move = self.poses.moved_by()[view]
-        axes = rotated(torch.from_numpy(target.axes), move[:3].expand(3, 3))
-        return target.seen_from(axes.numpy(), target.centre + move[3:].numpy())
-
-    def _factors(self, view: int) -> Annotated[Floats, "3"] | None:
-        """Factors of renders of a view; None = 1."""
-        return None if self.tones is None else self.tones(torch.tensor([view]))[0].detach().numpy()
 
     def _learning_rates(self, share: float) -> Annotated[Floats, "R"]:
         """Learning rates of the columns, when a share of the training is over; 0 of what is not learnt."""
         sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "sh0": 3, "shN": 3 * (self.bands - 1)}
-        rates = np.concatenate([np.full(size, _RATES[name]) for name, size in sizes.items()])
-        rates[MEANS] *= self.scene_scale
-        falls = np.full(len(rates), 0.2**share)
-        falls[MEANS] = 0.05**share
-        if self.only is not None:
-            rates[: HARMONICS.start if self.only == "colours" else None] = 0
+        rates = np.concatenate([np.full(size, _LEARNING_RATES[name]) for name, size in sizes.items()])
+        rates[MEANS] *= self.bounds.scene_scale
+        falls = np.full(len(rates), _FINAL_RATE_SHARE**share)
+        falls[MEANS] = _FINAL_MEANS_RATE_SHARE**share
+        if self.stage.only == "colours":
+            rates[: HARMONICS.start] = 0
+        elif self.stage.only == "poses":
+            rates[:] = 0
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
-
-    @torch.no_grad()
-    def _correct_view(self, view: int, target: Target, measured: Learnt, share: float) -> None:
-        """Move the exposure and the pose of a view by a step of Adam; their rates fall to a tenth.
-
-        Each view counts its own steps: with moments of all views together, one that is seen every thousandth
-        step moved by the root of a thousand times the rate, and far scenes got worse.
-        """
-        if self.tones is not None and self.only != "poses":
-            # The factor is exp(gain + exponent * exposure): a slope by the exponent is that by the gain,
-            # times the exposure.
-            pull = torch.from_numpy(measured.pull)
-            rate = self.config.rate * 0.1**share
-            _adam_step([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN_RATE * rate)
-            if self.tones.exponent.requires_grad:
-                slope = pull.sum() * self.tones.exposure[view]
-                _adam_step(self.corrections["tones.exponent"], slope, _EXPONENT_RATE * rate)
-        if self.poses is not None:
-            # The gradient of a rotation vector is taken for that of a further turn: exact to first order in
-            # how far views turn.
-            gradient = torch.from_numpy(measured.of_camera)
-            slope = torch.cat(
-                [torch.from_numpy(target.axes).T @ gradient[:3], self.poses.reach * gradient[3:]]
-            ).float()
-            _adam_step(
-                [each[view] for each in self.corrections["poses.offset"]],
-                slope,
-                self.config.poses * 0.1**share,
-            )
 
     def _relocate_and_grow(self, step: int, level: Level, share: float) -> None:
         """Split Gaussians where views err: as many as became transparent, which move there, and as the number
@@ -354,7 +332,8 @@ class GaussianLearner(SceneLearner):
         # weight there.
         sums = np.zeros((model.count, 3))
         for view in draw.permutation(self._sharp(level))[:_ERROR_VIEWS]:
-            sums += model.errors(self._target(level, view), self.config.background, self._factors(view))
+            target = self.corrections.moved(level[view], view)
+            sums += model.errors(target, self.config.background, self.corrections.factors(view))
         error, sky, seen = sums.T
         # The chance of a split: opacity times error, so that neither haze nor what is right already becomes
         # more.
@@ -362,9 +341,9 @@ class GaussianLearner(SceneLearner):
         chance = np.nan_to_num(error * opacity)
         # Used again elsewhere: what is transparent, and what shows almost only in the sky and so floats
         # before it.
-        reusable = (opacity < _DEAD) | (sky > _SKY * np.maximum(seen, _SEEN))
-        if self.inside is not None:
-            inside = self.inside(torch.from_numpy(model.read(MEANS))).numpy()
+        reusable = (opacity < _MIN_OPACITY) | (sky > _MAX_SKY_SHARE * np.maximum(seen, _MIN_SKY_PIXELS))
+        if self.bounds.inside is not None:
+            inside = self.bounds.inside(torch.from_numpy(model.read(MEANS))).numpy()
             chance = chance * inside
             reusable = reusable & inside
         reused = np.flatnonzero(reusable)
@@ -381,7 +360,9 @@ class GaussianLearner(SceneLearner):
             to = np.concatenate([reused, np.arange(model.count, model.count + more)])[:many]
             model.split(picked, to, *halves(model.read(index=picked), opacity[picked]))
         # Neighbours in space drift apart in memory, and tiles slow down.
-        if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * model.count:
+        if (step + 1) % (
+            _SORT_EVERY_RELOCATIONS * self.config.relocate_every
+        ) == 0 or more > _SORT_GROWTH_SHARE * model.count:
             model.reorder(curve_order(model.read(MEANS)))
 
     def figures(self) -> Figures:
@@ -398,11 +379,8 @@ class GaussianLearner(SceneLearner):
         """
         first, second, weight = (torch.from_numpy(part) for part in self.model.moments())
         tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
-        for name, kept in self.corrections.items():
-            tensors |= {f"{name}.{key}": each.clone() for key, each in zip(_KEPT, kept, strict=True)}
-        if self.poses is not None:
-            tensors[MOVES] = self.poses.moved_by()
-        return State(tensors_of(self.gaussians(), self.near), tensors)
+        tensors |= self.corrections.tensors()
+        return State(tensors_of(self.gaussians(), self.bounds.near), tensors)
 
     def load(self, state: State) -> None:
         """Go on from a checkpoint; without their moments, tones and poses go on as they are.
@@ -415,30 +393,25 @@ class GaussianLearner(SceneLearner):
         self.failed = 0
         weight = moments["weight"].numpy() if "weight" in moments else 1
         self.model.start(rows, moments["first"].numpy(), moments["second"].numpy(), weight)
-        for name, kept in self.corrections.items():
-            for key, each in zip(_KEPT, kept, strict=True):
-                if f"{name}.{key}" in moments:
-                    each.copy_(moments[f"{name}.{key}"])
+        self.corrections.load(moments)
 
     def begin(self, run: Run) -> str:
-        most = self.config.limited(len(self.levels[0]))
-        passes = f"; at most {most} steps: {self.config.most_passes} passes over the photographs (--passes)"
-        names = self.known.names if self.known is not None else ()
-        dull = sorted(self.levels[0].blurred)
-        few = ", ".join(Path(names[view]).name for view in dull[:_NAMED]) + (
-            ", ..." if len(dull) > _NAMED else ""
-        )
-        if dull:
-            blur = f"; blurred, and so shown rarely: {len(dull)} of {len(self.levels[0])} ({few})"
-        else:
-            blur = ""
-        light = ", tones" if self.tones is not None else ""
-        if self.device == CPU:
-            where = ""
-        else:
-            where = f", on {self.device} by gsplat"
-        limit = passes if most < self.config.most_steps else ""
-        line = f", {self.model.count} Gaussians at {self.origin}{light}{where}{blur}{limit}"
+        assert self.source is not None  # learners of a run have it
+        tones = "" if self.corrections.tones is None else ", tones"
+        where = "" if self.device == CPU else f", on {self.device} by gsplat"
+        line = f", {self.model.count} Gaussians at {self.source.points}{tones}{where}"
+        blurred = sorted(self.levels[0].blurred)
+        if blurred:
+            names = [Path(self.source.known.names[view]).name for view in blurred[:_MAX_NAMED_PHOTOGRAPHS]]
+            if len(blurred) > len(names):
+                names.append("...")
+            line += f"; blurred, and so shown rarely: {len(blurred)} of {len(self.levels[0])}"
+            line += f" ({', '.join(names)})"
+        steps = self.config.limited(len(self.levels[0]))
+        if steps < self.config.most_steps:
+            line += (
+                f"; at most {steps} steps: {self.config.most_passes} passes over the photographs (--passes)"
+            )
         return line + left_out(self.asked)
 
 
@@ -468,22 +441,11 @@ def halves(
     turns: Floats = rotations(torch.from_numpy(first[:, QUATERNION])).numpy()
     across = turns[which, :, longest] * np.exp(size)[:, None]
     # Both halves are alike: shorter along that axis, and fainter, as they overlap.
-    first[which, LOG_SCALES.start + longest] += math.log(_SPLIT_SIZE)
-    each = np.clip(_SPLIT_OPACITY * opacity, _DEAD, 0.995)
+    first[which, LOG_SCALES.start + longest] += math.log(_HALF_WIDTH_SHARE)
+    each = np.clip(_HALF_OPACITY_SHARE * opacity, _MIN_OPACITY, _MAX_OPACITY)
     first[:, LOGIT] = np.log(each / (1 - each))[:, None]
     # They lie on either side of the middle.
     second = first.copy()
-    first[:, MEANS] += _SPLIT_DISTANCE * across
-    second[:, MEANS] -= _SPLIT_DISTANCE * across
+    first[:, MEANS] += _HALF_DISTANCE_SHARE * across
+    second[:, MEANS] -= _HALF_DISTANCE_SHARE * across
     return first, second
-
-
-def _adam_step(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
-    """One step of Adam (Kingma and Ba 2015, Algorithm 1), in place, on a value, its two moments and the
-    number of steps.
-    """
-    value, first, second, steps = kept
-    steps += 1
-    first.lerp_(gradient, 1 - 0.9)
-    second.lerp_(gradient.square(), 1 - 0.999)
-    value -= rate * first / (1 - 0.9**steps) / ((second / (1 - 0.999**steps)).sqrt() + 1e-8)

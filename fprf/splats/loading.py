@@ -22,22 +22,27 @@ from ..training.quality import PRESETS, QualityConfig, tone_of
 from ..training.run import Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_tensors
-from .learner import GaussianLearner, refined
+from .learner import Bounds, GaussianLearner, Stage, refined
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
 from .scene import SplatScene
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors
+from .view_corrections import ViewCorrections
 
-_FIT_RATE = 2e-3
-_FIT_STEPS = 120
-"""Rate of poses (`GaussiansConfig.poses`) and steps of each view, where poses of views are fitted to a
-finished scene.
+_FIT_POSES_RATE = 2e-3
+"""Rate (`GaussiansConfig.poses`) at which poses of views are fitted to a finished scene: what suits poses that
+are off by some pixels (poses.json).
 """
-_VIEWS = 32
-"""Training views that semantics are found in, at most."""
-_LEVELS = "levels"
-_MANY = 400_000
-"""Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
+_FIT_STEPS_PER_VIEW = 120
+"""Steps of each view in fitting its pose; by eye: at its rate a pose moves by 0.1 in so many."""
+_MAX_SEMANTIC_VIEWS = 32
+"""Training views that semantics are found in, at most; by eye, as `LookConfig.views`."""
+_FOLLOWED_SHARE = 4
+"""Of a scene in training semantics are found in so many times fewer views, so that looks follow it; by eye."""
+_LEVELS_FOLDER = "levels"
+"""Folder of a run that holds its levels of detail."""
+_MIN_MAPPED_GAUSSIANS = 400_000
+"""Gaussians from which on levels of detail are kept there and mapped, not made in memory; by eye."""
 
 
 def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityConfig) -> LoadedRun[SplatScene]:
@@ -56,7 +61,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     # Levels of detail were written from what was verified.
     key = "" if merged is None else checkpoint.digest(run.checkpoints)
     saved, _ = checkpoint.load_latest(
-        run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None
+        run.checkpoints, verify=not key or open_levels(root / _LEVELS_FOLDER, key) is None
     )
     if saved is None:
         raise CheckpointError(
@@ -76,9 +81,11 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     training = in_training(root)
     # What a training has learnt so far is looked at quickly, in few, small views, and not kept.
     if training:
-        count, side = (_VIEWS // 4, config.semantic_size // 2)
+        count = _MAX_SEMANTIC_VIEWS // _FOLLOWED_SHARE
+        side = config.semantic_size // 2
     else:
-        count, side = (_VIEWS, config.semantic_size)
+        count = _MAX_SEMANTIC_VIEWS
+        side = config.semantic_size
     encoder = functools.cache(config.semantic.encoder.build)
 
     def found() -> Semantics:
@@ -116,11 +123,11 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         """Levels of detail; those of many Gaussians lie in a file, written where there is none of this
         checkpoint.
         """
-        if len(gaussians) < _MANY:
+        if len(gaussians) < _MIN_MAPPED_GAUSSIANS:
             return make_levels_of_detail(gaussians)
-        if open_levels(root / _LEVELS, key) is None:
-            write_levels(root / _LEVELS, gaussians, key)
-        mapped = open_levels(root / _LEVELS, key)
+        if open_levels(root / _LEVELS_FOLDER, key) is None:
+            write_levels(root / _LEVELS_FOLDER, gaussians, key)
+        mapped = open_levels(root / _LEVELS_FOLDER, key)
         assert mapped is not None  # it was just written
         return mapped
 
@@ -169,8 +176,14 @@ def fit_poses(
     )
     levels = make_levels(scene, images, masks, near)
     # A learner of poses alone: the Gaussians are drawn as they are, in the light of each view.
-    config = replace(config, poses=_FIT_RATE, degree=gaussians.degree)
-    learner = GaussianLearner(config, levels, 1.0, len(gaussians), tones=tones, poses=poses, only="poses")
+    config = replace(config, poses=_FIT_POSES_RATE, degree=gaussians.degree)
+    learner = GaussianLearner(
+        config,
+        levels,
+        Bounds(room=len(gaussians), scene_scale=1.0),
+        corrections=ViewCorrections(tones, poses),
+        stage=Stage(only="poses"),
+    )
     learner.start_from(gaussians)
-    learn(learner, None, Schedule(_FIT_STEPS * len(views)), lambda report: None)
+    learn(learner, None, Schedule(_FIT_STEPS_PER_VIEW * len(views)), lambda report: None)
     return poses.moved_by()

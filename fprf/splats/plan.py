@@ -4,8 +4,7 @@ P pixels of a photograph, V training views, N Gaussians. On the machine that the
 step takes A s P + B N, where s is the share of the full size's pixels that a step sees on average: the first
 steps see reduced ones. On a CUDA device with gsplat some steps are made to see what one takes there.
 
-Size counts first, the number of Gaussians second. Five minutes of llff_flower at 1008 x 756 come to 28.0 dB
-with 160 000 Gaussians, 27.9 with 120 000 (benchmarks/results/splat_training.json).
+Size counts first, the number of Gaussians second.
 """
 
 import math
@@ -26,39 +25,68 @@ if TYPE_CHECKING:
     from ..datamanagers.scene import ParsedScene
     from .config import GaussiansConfig
 
-_PIXEL = 91e-9
-_GAUSSIAN = 103e-9
-"""A and B in seconds, on two x86-64 cores."""
-_START = 6.0
-"""Seconds before the first step, at least: reading photographs, first points."""
-_STEPS = 900
-_PASSES = 5
-"""Steps, and passes over the views, below which photographs are reduced further."""
-_SMALL = 640 * 360
-"""Pixels of photographs that may be passed over `most_passes` times."""
-_LEAST = 400 * 225
-"""Pixels below which none is reduced for lack of time."""
-_PATIENCE = 600.0
+# What a step takes on the machine of the constants, two x86-64 cores; fitted when the plan was made.
+
+_SECONDS_PER_PIXEL = 91e-9
+"""A."""
+_SECONDS_PER_GAUSSIAN = 103e-9
+"""B."""
+_START_SECONDS = 6.0
+"""Seconds before the first step, at least: reading photographs, first points; by eye."""
+
+# What the size of the photographs is decided by.
+
+_MIN_STEPS = 900
+"""Steps below which photographs are reduced further; by eye."""
+_MIN_PASSES = 5
+"""Passes over the views below which photographs are reduced further; by eye."""
+_SMALL_PIXELS = 640 * 360
+"""Pixels of photographs that may be passed over `most_passes` times; of larger ones there is more to learn."""
+_MIN_PIXELS = 400 * 225
+"""Pixels below which no photograph is reduced for lack of time; by eye."""
+_MAX_UNTIMED_SECONDS = 600.0
 """Seconds within which steps have to end where no minutes are given: larger photographs are reduced."""
-_FEWEST = 60_000
-_MOST = 1_000_000
-_GROWTH = 0.6
-"""Gaussians of a minute, the most of all, and the power of the time that their number grows with."""
-_PROBE = 1 << 16
-_REPEATS = 200
-_REFERENCE = 55e-6
-"""Numbers whose exponential is taken, how often, and the seconds of the fastest on one of the two cores named
-above.
-"""
-_SIZES = ((480, 270), (1920, 1080))
-_FIRST = 20
-_TIMED = 10
-_BESIDES = 1.4
-"""Images of the steps that are made on a CUDA device, steps before any is timed, those of which the fastest
-counts, and what a step of training takes in units of these, with all that is done between steps.
+
+# What the number of Gaussians is decided by.
+
+_MIN_GAUSSIANS = 60_000
+"""Gaussians of a minute, and of less."""
+_MAX_GAUSSIANS = 1_000_000
+"""Gaussians of any time, at most: bounds the memory, 0.6 GB in training (training_steps.json)."""
+_GROWTH_POWER = 0.6
+"""Power of the time that the number of Gaussians grows with; by eye: 160 000 in five minutes, with which
+llff_flower comes to 28.0 dB, and to 27.9 with 120 000 (splat_training.json).
 """
 _NOTICE_SECONDS = 3.0
 """Preparing kernels for longer than this means that they are compiled; by eye, as it takes a minute."""
+_GAUSSIANS_STEP = 10_000
+"""Their number is a multiple of this."""
+
+# How fast this machine is.
+
+_EXPONENTIALS = 1 << 16
+"""Numbers whose exponential is taken."""
+_EXPONENTIAL_REPEATS = 200
+"""How often: the fastest counts, as other work only slows it down."""
+_REFERENCE_SECONDS = 55e-6
+"""Seconds of the fastest on one of the two cores named above."""
+_REFERENCE_CORES = 2
+"""Cores of the machine of the constants."""
+_CORES_POWER = 0.8
+"""Power of the number of cores that the speed grows with: a part of a step is done by one; by eye."""
+
+# How fast a CUDA device is, by steps that are made there.
+
+_TIMED_SIZES = ((480, 270), (1920, 1080))
+"""Width and height of their images: what a pixel takes follows from the difference."""
+_WARM_UP_STEPS = 20
+"""Steps before any is timed; by eye."""
+_TIMED_STEPS = 10
+"""Steps of which the fastest counts; by eye."""
+_WHOLE_STEP_RATIO = 1.4
+"""What a step of training takes in units of these, with all that is done between steps; by eye."""
+_MIN_CARD_SECONDS = 1e-4
+"""Seconds of a step there, at least: what launching its kernels takes, whatever the size; by eye."""
 
 
 def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) -> "GaussiansConfig":
@@ -76,21 +104,21 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
     speed = device_speed(device)
     budget = None
     if config.minutes is not None:
-        budget = max(1.0, 60 * config.minutes - _START)
+        budget = max(1.0, 60 * config.minutes - _START_SECONDS)
     # The largest size at which the time is enough for some passes over the photographs.
     size = config.downscale or max(1, longest / config.longest)
     while True:
         small = pixels / size**2
         found = _of_size(config, small)
-        each = _seconds(found, small, _FEWEST)
+        each = _seconds(found, small, _MIN_GAUSSIANS)
         steps = found.limited(views)
         times = speed(_share(found) * small)
         if budget is None:
-            enough = steps * each <= _PATIENCE * times
+            enough = steps * each <= _MAX_UNTIMED_SECONDS * times
         else:
-            enough = budget * times / each >= max(_STEPS, _PASSES * views)
+            enough = budget * times / each >= max(_MIN_STEPS, _MIN_PASSES * views)
         smaller = math.floor(size) + 1
-        if enough or config.downscale is not None or pixels / smaller**2 < _LEAST:
+        if enough or config.downscale is not None or pixels / smaller**2 < _MIN_PIXELS:
             break
         size = smaller
     # On the machine of the constants, so that a faster one has more Gaussians.
@@ -100,7 +128,9 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
         seconds = min(budget * times, steps * each)
     cap = config.cap
     if cap is None:
-        cap = min(_MOST, max(_FEWEST, 10_000 * round(_FEWEST / 10_000 * (seconds / 60) ** _GROWTH)))
+        wanted = _MIN_GAUSSIANS / _GAUSSIANS_STEP * (seconds / 60) ** _GROWTH_POWER
+        cap = _GAUSSIANS_STEP * round(wanted)
+        cap = min(_MAX_GAUSSIANS, max(_MIN_GAUSSIANS, cap))
         if not config.cells.cuts:
             cap = min(cap, max(1, int(views * pixels / size**2) // config.pixels_per_gaussian))
     return replace(found, downscale=size, cap=cap)
@@ -112,26 +142,26 @@ def _of_size(config: "GaussiansConfig", pixels: float) -> "GaussiansConfig":
     """
     if config.passes is not None:
         return config
-    return replace(config, passes=round(config.most_passes * max(1.0, math.sqrt(pixels / _SMALL))))
+    return replace(config, passes=round(config.most_passes * max(1.0, math.sqrt(pixels / _SMALL_PIXELS))))
 
 
 def machine_speed() -> float:
     """Speed of this machine relative to the one of the constants, from the exponentials that its fastest core
     takes in time.
     """
-    values = torch.linspace(-8.0, 0.0, _PROBE)
+    values = torch.linspace(-8.0, 0.0, _EXPONENTIALS)
     best = math.inf
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        for _ in range(_REPEATS):
+        for _ in range(_EXPONENTIAL_REPEATS):
             start = time.perf_counter()
             torch.exp(values)
             best = min(best, time.perf_counter() - start)
     finally:
         torch.set_num_threads(threads)
     # A step's work is spread over the cores but for a part.
-    return _REFERENCE / best * math.pow(threads / 2, 0.8)
+    return _REFERENCE_SECONDS / best * math.pow(threads / _REFERENCE_CORES, _CORES_POWER)
 
 
 def device_speed(device: torch.device) -> Callable[[float], float]:
@@ -149,38 +179,40 @@ def _card_speed(device: torch.device) -> Callable[[float], float]:
     """The same of a CUDA device on which gsplat draws, by some steps there."""
     draw = np.random.default_rng(0)
     # Gaussians before a camera, about as wide as they lie apart.
-    rows = 0.1 * draw.standard_normal((_FEWEST, 59), np.float32)
-    depth = draw.uniform(2, 8, _FEWEST)
-    rows[:, :2], rows[:, 2] = draw.uniform(-0.6, 0.6, (_FEWEST, 2)) * depth[:, None], depth
+    rows = 0.1 * draw.standard_normal((_MIN_GAUSSIANS, 59), np.float32)
+    depth = draw.uniform(2, 8, _MIN_GAUSSIANS)
+    rows[:, :2] = draw.uniform(-0.6, 0.6, (_MIN_GAUSSIANS, 2)) * depth[:, None]
+    rows[:, 2] = depth
     rows[:, 3:6] += np.log(3e-3 * depth)[:, None]
-    model = trainable(_FEWEST, 16, device)
+    model = trainable(_MIN_GAUSSIANS, 16, device)
     model.start(rows)
     pixels = []
     seconds = []
-    for width, height in _SIZES:
+    for width, height in _TIMED_SIZES:
         focal = 0.8 * width
         intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         camera = Pinhole(intrinsics, torch.eye(4), width, height)
         target = target_on(device, camera, draw.random((height, width, 3), np.float32))
         best = math.inf
-        for step in range(_FIRST + _TIMED):
+        for step in range(_WARM_UP_STEPS + _TIMED_STEPS):
             start = time.perf_counter()
             model.learn(target, background=(0.0, 0.0, 0.0), ssim=0.2, rates=np.full(59, 1e-5, np.float32))
-            if step >= _FIRST:
+            if step >= _WARM_UP_STEPS:
                 best = min(best, time.perf_counter() - start)
-            else:
-                best = best
         pixels.append(width * height)
-        seconds.append(_BESIDES * best)
+        seconds.append(_WHOLE_STEP_RATIO * best)
     slope = max(0.0, (seconds[1] - seconds[0]) / (pixels[1] - pixels[0]))
-    return lambda many: (
-        (_PIXEL * many + _GAUSSIAN * _FEWEST) / max(seconds[0] + slope * (many - pixels[0]), 1e-4)
-    )
+
+    def speed(many: float) -> float:
+        reference = _SECONDS_PER_PIXEL * many + _SECONDS_PER_GAUSSIAN * _MIN_GAUSSIANS
+        return reference / max(seconds[0] + slope * (many - pixels[0]), _MIN_CARD_SECONDS)
+
+    return speed
 
 
 def _seconds(config: "GaussiansConfig", pixels: float, gaussians: int) -> float:
     """Seconds of a step, on average, on the machine of the constants."""
-    return _PIXEL * _share(config) * pixels + _GAUSSIAN * gaussians
+    return _SECONDS_PER_PIXEL * _share(config) * pixels + _SECONDS_PER_GAUSSIAN * gaussians
 
 
 def _share(config: "GaussiansConfig") -> float:

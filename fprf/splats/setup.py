@@ -28,36 +28,42 @@ from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig
 from .initial import Points, initial_points, projected, surroundings
-from .learner import CPU, GaussianLearner, LimitWidths
+from .learner import CPU, Bounds, GaussianLearner, LimitWidths, Source
 from .photographs import load_photographs, make_levels
+from .view_corrections import ViewCorrections
 
-_SURROUNDINGS = 10
-"""Gaussians, at most, for one of the surroundings."""
-_SPHERE_WIDTH = 0.2
-_INSIDE_SPHERE = 0.5
-"""Greatest width of the surroundings, and distance from the middle up to which Gaussians are none of them: in
-radii.
+_MIN_GAUSSIANS_PER_SURROUNDING = 10
+"""Gaussians for one of the surroundings, at least; by eye."""
+_MAX_SURROUNDING_WIDTH = 0.2
+"""Greatest width of the surroundings, in radii of their sphere; by eye."""
+_MAX_INSIDE_DISTANCE = 0.5
+"""Distance from the middle of the sphere, in its radii, up to which Gaussians are none of the surroundings; by
+eye: the sphere is ten times as large as the scene.
 """
-_WIDTH = 0.5
-_WIDTH_IN_CELLS = 0.25
-"""Greatest width of all others in distances to the nearest camera; in scenes of cells."""
-_EVERY = 20
-_EVERY_IN_CELLS = 100
-_SPHERE_EVERY = 10
-"""Steps between cuts of widths; in scenes of cells; of the surroundings."""
-_TOGETHER = 256
-_PAIRS = 1 << 16
-"""Gaussians whose distances to cameras are taken together, at least, and pairs of both, where cameras are
-few.
+_MAX_WIDTH = 0.5
+"""Greatest width of all others, in distances to the nearest camera; by eye: wider ones are haze."""
+_MAX_WIDTH_IN_CELLS = 0.25
+"""The same in scenes of cells, each of whose photographs is seen rarely; by eye."""
+_WIDTH_EVERY_STEPS = 20
+"""Steps between cuts of widths; by eye."""
+_WIDTH_EVERY_STEPS_IN_CELLS = 100
+"""The same in scenes of cells, where there are more cameras to measure distances to; by eye."""
+_SPHERE_EVERY_STEPS = 10
+"""Steps between cuts of the surroundings, which takes next to no time; by eye."""
+_MIN_GAUSSIANS_AT_ONCE = 256
+"""Gaussians whose distances to cameras are taken together, at least; by eye."""
+_MAX_PAIRS_AT_ONCE = 1 << 16
+"""Pairs of Gaussians and cameras whose distances are taken together, where cameras are few; by eye."""
+_MAX_NEAR_POINTS = 4000
+"""Points that say how near to a camera things are, at most: enough for a quantile of all."""
+_MAX_NEAR_DEPTHS = 10_000_000
+"""Depths of these points in all views that are sorted, at most: bounds the memory."""
+_NEAR_SHARE = 0.25
+"""The near plane as a share of the distance that all but 1 % of the points in view have; by eye: haze right
+before a lens is nearer.
 """
-_NEAR_POINTS = 4000
-_NEAR_DEPTHS = 10_000_000
-"""Points, and depths of them in all views, that say how near to a camera things are, at most."""
-_NEAR = 0.25
-_NEAR_UNSEEN = 1e-3
-"""The near plane as a share of the distance that all but 1 % of the points in view have; of the scene scale,
-where no view has any point.
-"""
+_NEAR_UNSEEN_SHARE = 1e-3
+"""The near plane as a share of the scene scale, where no view has any point; by eye."""
 
 
 def build(
@@ -76,7 +82,9 @@ def build(
         pixels = int(scene.cameras.size[scene.train].prod(1).sum())
         cap = max(1, min(config.most, pixels // config.pixels_per_gaussian))
         config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.most))
-    config = replace(config, surroundings=min(config.surroundings, config.most // _SURROUNDINGS))
+    config = replace(
+        config, surroundings=min(config.surroundings, config.most // _MIN_GAUSSIANS_PER_SURROUNDING)
+    )
     images, masks, skies = load_photographs(config, scene, scene.train.tolist())
     facts = saved or light_and_poses(config, scene, lambda view: images[view])
     # Gaussians begin at points of the reconstruction, or at matches between views ...
@@ -93,15 +101,15 @@ def build(
     learner = GaussianLearner(
         config,
         make_levels(scene, images, masks, near, skies, device=device),
-        scene_scale(scene),
-        max(config.most, len(points.position) + config.surroundings),
-        None if sphere is None else sphere.encloses,
-        limit_widths(scene, near, cells=config.cells.cuts, sphere=sphere),
-        near=near,
-        tones=tones_of(facts),
-        poses=poses_of(facts, 1.0),
-        known=known_of(scene, config.data, facts),
-        origin=origin,
+        Bounds(
+            room=max(config.most, len(points.position) + config.surroundings),
+            scene_scale=scene_scale(scene),
+            near=near,
+            inside=None if sphere is None else sphere.encloses,
+            limit_widths=limit_widths(scene, near, cells=config.cells.cuts, sphere=sphere),
+        ),
+        corrections=ViewCorrections(tones_of(facts), poses_of(facts, 1.0)),
+        source=Source(known=known_of(scene, config.data, facts), points=origin),
         device=device,
     )
     learner.begin_at(points, draw, far)
@@ -125,7 +133,7 @@ class _Sphere(NamedTuple):
     def encloses(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Mask of the means that lie well within."""
         apart: Tensor = (means - self.centre).norm(dim=1)
-        return apart < _INSIDE_SPHERE * self.radius
+        return apart < _MAX_INSIDE_DISTANCE * self.radius
 
 
 def limit_widths(
@@ -140,9 +148,9 @@ def limit_widths(
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
     if cells:
-        share, every = (_WIDTH_IN_CELLS, _EVERY_IN_CELLS)
+        share, every = (_MAX_WIDTH_IN_CELLS, _WIDTH_EVERY_STEPS_IN_CELLS)
     else:
-        share, every = (_WIDTH, _EVERY)
+        share, every = (_MAX_WIDTH, _WIDTH_EVERY_STEPS)
 
     def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
@@ -154,11 +162,13 @@ def limit_widths(
 
     def limit(gaussians: Trainable, step: int) -> None:
         # Seen from beside, a wide one of the surroundings would be drawn before the scene.
-        if sphere is not None and step % _SPHERE_EVERY == 0:
+        if sphere is not None and step % _SPHERE_EVERY_STEPS == 0:
             apart = gaussians.read(MEANS) - sphere.centre.numpy()
-            far = np.flatnonzero(np.einsum("nk,nk->n", apart, apart) >= (_INSIDE_SPHERE * sphere.radius) ** 2)
+            far = np.flatnonzero(
+                np.einsum("nk,nk->n", apart, apart) >= (_MAX_INSIDE_DISTANCE * sphere.radius) ** 2
+            )
             gaussians.limit_scales(
-                np.full(len(far), math.log(_SPHERE_WIDTH * sphere.radius), np.float32), far
+                np.full(len(far), math.log(_MAX_SURROUNDING_WIDTH * sphere.radius), np.float32), far
             )
         # What is narrower than the share of `near` is narrow enough everywhere that it is drawn: distances
         # cost time.
@@ -166,7 +176,7 @@ def limit_widths(
             wide = np.flatnonzero(gaussians.read(LOG_SCALES).max(1) > math.log(share * near))
             if len(wide):
                 points = torch.from_numpy(gaussians.read(MEANS, wide))
-                together = max(_TOGETHER, _PAIRS // len(centres))
+                together = max(_MIN_GAUSSIANS_AT_ONCE, _MAX_PAIRS_AT_ONCE // len(centres))
                 distance = torch.cat([nearest_camera(part) for part in torch.split(points, together)])
                 gaussians.limit_scales((share * distance).clamp_min(1e-12).log().numpy(), wide)
 
@@ -193,8 +203,8 @@ def find_near(scene: ParsedScene, points: Points) -> float:
 
     Of some of the points and depths, evenly spread; where no view has any, a thousandth of the scene scale.
     """
-    some = torch.from_numpy(points.position[:: -(-len(points.position) // _NEAR_POINTS)])
+    some = torch.from_numpy(points.position[:: -(-len(points.position) // _MAX_NEAR_POINTS)])
     seen = torch.cat([depth[inside] for _, _, depth, inside in projected(scene, some)])
     if not len(seen):
-        return _NEAR_UNSEEN * scene_scale(scene)
-    return _NEAR * float(seen[:: -(-len(seen) // _NEAR_DEPTHS)].quantile(0.01))
+        return _NEAR_UNSEEN_SHARE * scene_scale(scene)
+    return _NEAR_SHARE * float(seen[:: -(-len(seen) // _MAX_NEAR_DEPTHS)].quantile(0.01))

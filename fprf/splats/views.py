@@ -32,11 +32,11 @@ from .photographs import camera_of
 
 MIN_ROOM_SIZE_RATIO = 2.5
 """Size of the Gaussians of the outer fifth over that of the inner half, from which on a capture is a room.
-Eight objects have 0.8 to 1.8, m360_bonsai 4.1 (capture_kinds.json).
+Eight objects have 0.8 to 1.8, four scenes from within 2.7 to 4.1 (capture_kinds.json).
 """
 MIN_ROOM_TAIL_RATIO = 6.0
 """Distance of the outermost thousandth from the middle over the median distance, from which on a capture is a
-room. Eight objects have 1.8 to 3.7, m360_bonsai 23 (capture_kinds.json).
+room. Eight objects have 1.8 to 3.7, four scenes from within 23 to 50 (capture_kinds.json).
 """
 _MIN_SEEN_OPACITY = 0.3
 """Opacity from which on Gaussians count in these two."""
@@ -48,7 +48,7 @@ _MIN_SEEN_GAUSSIANS = 100
 _MAX_DEVIATION_SHARE = 0.8
 """Median deviation of size less logarithm of the distance from the place that explains sizes best, as a share
 of that of the sizes alone, up to which photographs were taken about that place. Eight objects, photographed
-from all around, have 0.89 or more, m360_bonsai 0.79 (capture_kinds.json).
+from all around, have 0.89 or more; four scenes from within 0.79 to 0.92 (capture_kinds.json).
 """
 _MAX_ROOM_DEVIATION_SHARE = 0.9
 """The same of a room, whose cameras stand within in any case."""

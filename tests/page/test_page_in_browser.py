@@ -15,9 +15,9 @@ from pages import recoloured, seen, street, written
 from splat_ball import ball
 
 from fprf.rendering.paths import look_at, pinhole
+from fprf.splats.drawing import draw
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
-from fprf.splats.views import draw
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 DRAW = """async ([view, lens, width, height, look]) => {

@@ -19,7 +19,7 @@ from fprf.io.images import write_image
 from fprf.splats import cells
 from fprf.splats.cells import CellPart, load_cells, open_cell
 from fprf.splats.files import read_capture
-from fprf.splats.learner import MOVES
+from fprf.splats.view_corrections import MOVES
 from fprf.training.camera_optimizers import Tones
 from fprf.training.checkpoint import load_latest
 from fprf.training.loading import open_run
@@ -69,7 +69,7 @@ def test_cells_go_on_from_the_exposures_of_the_whole_scene(
     """Which knows those of the photographs that it had memory for. Each cell moves its own, and not their
     mean.
     """
-    monkeypatch.setattr(cells, "_PIXELS", 1500)
+    monkeypatch.setattr(cells, "_MAX_OVERVIEW_PIXELS", 1500)
     run = tmp_path / "run"
     assert main(command(town, run, "--steps", "60", "--tones", "true")) == 0
     overview, _ = load_latest(run / "overview" / "checkpoints")
@@ -116,9 +116,9 @@ def test_cells_see_from_where_the_whole_scene_found_its_views(town: Path, tmp_pa
     given = Run(run).load_known()
     assert torch.equal(union.optimizer[MOVES], moves)
     assert (moves[list(given.train)] != 0).any(1).all() and not moves[list(given.test)].any()
-    known = part_of(run, town, 0).build().known
+    source = part_of(run, town, 0).build().source
     shown = open_run(run, "cpu").known.cameras
-    assert known is not None and torch.equal(known.cameras.pose, shown.pose)
+    assert source is not None and torch.equal(source.known.cameras.pose, shown.pose)
     assert not torch.equal(shown.pose, given.cameras.pose)
 
 

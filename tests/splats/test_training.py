@@ -31,10 +31,11 @@ from fprf.splats import setup as training
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
-from fprf.splats.learner import GaussianLearner
+from fprf.splats.learner import Bounds, GaussianLearner
 from fprf.splats.photographs import camera_of
 from fprf.splats.scene import SplatScene
 from fprf.splats.setup import build
+from fprf.splats.view_corrections import ViewCorrections
 from fprf.training import checkpoint, driver
 from fprf.training.camera_optimizers import Tones, moved_cameras
 from fprf.training.loading import open_run
@@ -119,7 +120,7 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     )
 
     def learnt(order: list[int]) -> Tensor:
-        learner = GaussianLearner(config, levels, 1.0, 32)
+        learner = GaussianLearner(config, levels, Bounds(room=32, scene_scale=1.0))
         learner.start_from(start)
         rates = np.full(learner.model.rows, 0.01, np.float32)
         for view in order:
@@ -152,7 +153,12 @@ def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(
     def gain(views: int) -> Tensor:
         tones = Tones(torch.zeros(many), ())
         levels = photographs.make_levels(replace(same, train=torch.arange(views)), images, {}, 0.01)
-        learner = GaussianLearner(replace(grey, degree=2), levels, 1.0, 16, tones=tones)
+        learner = GaussianLearner(
+            replace(grey, degree=2),
+            levels,
+            Bounds(room=16, scene_scale=1.0),
+            corrections=ViewCorrections(tones),
+        )
         learner.start_from(nothing)
         for step in range(3 * views):
             learner.step(step, 0.0)
@@ -177,8 +183,8 @@ def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: ParsedSce
             target.planes[: 3 * target.area].reshape(3, target.area)[:] *= wanted[view].exp().numpy()[:, None]
     stepped(learner)
     train = scene.train
-    assert learner.tones is not None
-    found = learner.tones(train).log().detach()
+    assert learner.corrections.tones is not None
+    found = learner.corrections.tones(train).log().detach()
     assert float(found.mean(0).abs().max()) < 1e-5
     true = wanted[train] - wanted[train].mean(0)
     assert float((found - true).square().mean()) < 0.75 * float(true.square().mean())
@@ -196,8 +202,8 @@ def test_poses_that_are_off_are_found(config: GaussiansConfig, scene: ParsedScen
     moves = torch.cat([turn, torch.zeros_like(turn)], 1)
     off = replace(scene, cameras=moved_cameras(scene.cameras, moves))
     learner = stepped(build(replace(config, poses=5e-3), off))
-    assert learner.poses is not None
-    found = learner.poses.refined(off.cameras)
+    assert learner.corrections.poses is not None
+    found = learner.corrections.poses.refined(off.cameras)
     assert torch.equal(found.pose[scene.test], scene.cameras.pose[scene.test])
 
     def error(cameras: Cameras) -> float:
@@ -428,7 +434,7 @@ def after_a_step_of_wide_ones(
     learner = build(config, scene)
     before = learner.gaussians()
     for each in (learner, build(config, scene) if restored else learner):
-        wide = tensors_of(replace(before, log_scales=before.log_scales + 8.0), each.near)
+        wide = tensors_of(replace(before, log_scales=before.log_scales + 8.0), each.bounds.near)
         moments = learner.state().optimizer
         learner = each
         learner.load(State(wide, moments))
@@ -485,7 +491,7 @@ def test_blurred_views_are_shown_in_every_eighth_epoch_alone(
     images = {view: np.zeros((24, 32, 3), np.uint8) for view in scene.train.tolist()}
     level = photographs.make_levels(scene, images, {}, 0.01)[0]
     views = len(level)
-    learner = GaussianLearner(config, [level], 1.0, 32)
+    learner = GaussianLearner(config, [level], Bounds(room=32, scene_scale=1.0))
 
     def shown(steps: range) -> list[int]:
         return [learner._view(level, step) for step in steps]
