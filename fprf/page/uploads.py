@@ -26,8 +26,8 @@ from ..datamanagers.image_files import kind_of
 from ..datamanagers.images import IMAGE_SUFFIXES
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, FprfError, UsageError
-from ..plugins.captures import endings, format_name
 from ..io.video_reader import VIDEO_SUFFIXES
+from ..plugins.captures import endings, format_name
 
 MAX_BYTES = 20 << 20
 """Bytes of a photograph."""
