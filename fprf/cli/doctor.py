@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +23,9 @@ from ..errors import ConfigError, DataError
 from ..plugins import registry
 from ..plugins.slots import slots
 from .parsing import parse
+
+if TYPE_CHECKING:
+    from ..datamanagers.photograph_files import Photographs
 
 _BYTES_PER_MIB = 1 << 20
 """For sizes in messages."""
@@ -244,9 +247,17 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     """
     from ..datamanagers.images import colour_notes, load_images, transparent_fault, useless_masks
     from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
+    from ..datamanagers.photograph_files import find_photographs
     from ..datamanagers.scene import find_sightings, sparser
 
-    parser = recognise(data)
+    try:
+        parser = recognise(data)
+    except DataError:
+        found = find_photographs(data) if data.is_dir() else None
+        if found is None or not found.files:
+            raise
+        yield from photographs_without_poses(data, found)
+        return
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
     scene = parse_scene(data, 1, parser)
     count = len(scene.paths)
@@ -259,7 +270,11 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     yield Finding("views", f"{count} of {shown} pixels, {' and '.join(lenses)} lens")
     yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
     for note in scene.notes:
-        yield Finding("note", note)
+        found_masks, call, remedy = note.partition("; call ")  # masks of which none fits
+        if remedy:
+            yield Finding("masks", found_masks, (call + remedy).removeprefix("; "))
+        else:
+            yield Finding("note", note)
     # Points begin the first Gaussians, where training views see them.
     if scene.points is None or not len(scene.points):
         yield Finding(
@@ -296,3 +311,21 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
         yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
     yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
+
+
+def photographs_without_poses(data: Path, photographs: "Photographs") -> Iterator[Finding]:
+    """What `fprf process` will take of a folder, and what it will leave out."""
+    from ..datamanagers.photograph_files import COPIES, equal_files, equal_pictures, left_out_note, shown_name
+
+    files = photographs.files
+    # Copies in another encoding are told where few are decoded; processing decodes all.
+    copies = equal_pictures(files) if len(files) <= _MAX_OPENED_VIEWS else equal_files(files)
+    yield Finding("format", "photographs without poses")
+    yield Finding("images", f"{len(files) - len(copies)} photographs")
+    notes = photographs.notes()
+    if copies:
+        names = sorted(shown_name(path.relative_to(data)) for path in copies)
+        notes.append(left_out_note(COPIES, names))
+    for note in notes:
+        yield Finding("note", note)
+    yield Finding("next", f"fprf process {shlex.quote(str(data))}")

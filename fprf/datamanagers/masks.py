@@ -213,10 +213,14 @@ class _Search:
         return [f"masks in {where}: {'; '.join(said)}"]
 
 
-def masks_in(folder: Path, photographs: Sequence[Path]) -> FoundMasks:
-    """Masks of photographs in one folder that somebody names."""
+def masks_in(folder: Path, photographs: Sequence[Path], *, for_all: bool = True) -> FoundMasks:
+    """Masks of photographs in one folder that somebody names; unless it is for all of them, masks of others are
+    not told.
+    """
     search = _Search(photographs, USED.words)
     search.look_into(folder, range(len(photographs)))
+    if any(search.masks) and not for_all:
+        search.unused = []
     return search.found()
 
 

@@ -167,7 +167,7 @@ class StyleConfig:
     """Weight of each reference, in their order, above 0; none = all alike."""
     masks: tuple[Path, ...] = ()
     """A picture for each reference, in their order: only what is white there makes style codes; `none` = all
-    of it.
+    of it. A folder of pictures is searched by the reference's name (docs/formats.md); one is for all.
     """
     stylizer: StylizerConfig = RegionToneConfig()
     """Method that moves the scene's features."""
@@ -223,7 +223,8 @@ class StyleConfig:
             parse_strength("region_strength", text)
         for name in ("weights", "masks"):
             given = len(getattr(self, name))
-            if given and self.references and given != len(self.references):
+            one_folder = name == "masks" and given == 1  # which `with_folders` sees
+            if given and self.references and given != len(self.references) and not one_folder:
                 raise ConfigError(
                     f"{name}: {given} {name} for {len(self.references)} references; give one each, or none"
                 )

@@ -158,13 +158,16 @@ def check_photographs(path: Path, file: StyleFile) -> None:
 
 
 def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
-    """The style with the images of each folder in the folder's place, all with its weight.
+    """The style with the images of each folder in the folder's place, all with its weight, and of folders of
+    masks the one that has the photograph's name (`datamanagers.masks`); one folder of masks is for all.
 
-    Images of folders that cannot be read are left out, and `report` is given the reason. Raises DataError for
-    a folder without a readable image, ConfigError for a mask over a folder.
+    Images of folders that cannot be read are left out, and `report` is given the reason, and told of photographs
+    without a mask. Raises DataError for a folder without a readable image, ConfigError for a mask over a folder
+    and for a folder of masks of which none fits.
     """
+    style = replace(style, masks=_mask_of_each(style))
     folders = {path for path in style.references if path.is_dir() and not is_scene(path)}
-    if not folders:
+    if not folders and not any(mask.is_dir() for mask in style.masks):
         return style
     from ..datamanagers.images import IMAGE_SUFFIXES, photographs
 
@@ -182,9 +185,10 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     for path, weight, mask in zip(
         style.references, style.weights or (1.0,) * count, style.masks or (NO_MASK,) * count, strict=True
     ):
-        if path in folders and mask != NO_MASK:
+        if path in folders and mask != NO_MASK and not mask.is_dir():
             raise ConfigError(
-                f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs"
+                f"masks: {mask} is for one photograph, {path} is a folder; write none, a folder of masks, or name the "
+                "photographs"
             )
         if path in folders:
             files = [file for file in within(path) if file not in known]
@@ -197,8 +201,40 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
         style,
         references=references,
         weights=weights if style.weights else (),
-        masks=masks if style.masks else (),
+        masks=_found_masks(references, masks, report) if style.masks else (),
     )
+
+
+def _mask_of_each(style: StyleConfig) -> tuple[Path, ...]:
+    """The masks, one a reference; one folder is for all that are photographs."""
+    given = len(style.masks)
+    if given == 0 or not style.references or given == len(style.references):
+        return style.masks
+    folder = style.masks[0]
+    if given == 1 and folder.is_dir():
+        return tuple(NO_MASK if is_scene(path) else folder for path in style.references)
+    raise ConfigError(
+        f"masks: {given} masks for {len(style.references)} references; give one each, a folder of them, or none"
+    )
+
+
+def _found_masks(
+    references: Sequence[Path], masks: Sequence[Path], report: Callable[[str], None]
+) -> tuple[Path, ...]:
+    """The mask of each photograph, in the place of the folder that it lies in."""
+    from ..datamanagers.masks import masks_in
+
+    found = list(masks)
+    for folder in {mask for mask in masks if mask != NO_MASK and mask.is_dir()}:
+        members = [k for k, mask in enumerate(masks) if mask == folder]
+        there = masks_in(folder, [references[k] for k in members], for_all=False)
+        if not there.masks:
+            raise ConfigError(f"masks: {' '.join(there.notes)}")
+        for note in there.notes:
+            report(note)
+        for k, mask in zip(members, there.masks, strict=True):
+            found[k] = NO_MASK if mask is None else mask
+    return tuple(found)
 
 
 def _with_paths(style: StyleConfig, change: Callable[[Path], Path]) -> StyleConfig:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from ..datamanagers.images import useless_masks
 from ..datamanagers.parsers.config import recognise
+from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, DataError, NumericsError, UsageError
 from ..interfaces import Figures, Learner
 from ..io.atomic import remove_unfinished
@@ -35,7 +36,7 @@ from ..scenes import Partition
 from . import checkpoint
 from .image_hashes import check_images, image_hashes, save_image_hashes
 from .locks import lock_folder
-from .prepare import device_of, planned, read_scene
+from .prepare import device_of, planned, read_whole_scene, scene_at_size
 from .run import Run
 
 REPORT_SECONDS = 0.5
@@ -103,13 +104,14 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     with lock_folder(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         # An existing run goes on with its own config and images; what was cut short there is removed.
-        config = _sized(run, config, display)
+        whole = read_whole_scene(config)
+        config = _sized(run, config, display, whole)
         _check_same(run, config)
         for folder in (output, *output.glob("blocks/*"), *output.glob("cells/*")):
             remove_unfinished(folder)
         # What the run found out when it was begun stays: its origin, and exposures that were measured then.
         saved = run.saved_facts()
-        scene = read_scene(config, saved)
+        scene = scene_at_size(config, whole, saved)
         for note in scene.notes:
             display.say(f"note: {note}")
         if config.masked and (said := useless_masks(scene)):
@@ -402,10 +404,12 @@ def _check_needs(config: RunConfig, method: str, display: Display) -> None:
     raise UsageError(f"fprf train {method}: {needs[0].what}: {needs[0].remedy}")
 
 
-def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
-    """The config with all decided that it leaves open, which an existing run has decided already."""
+def _sized(run: Run, config: RunConfig, display: Display, whole: ParsedScene) -> RunConfig:
+    """The config with all decided that it leaves open, which an existing run has decided already; `whole` is the
+    scene at its own size.
+    """
     if config.downscale is not None and config.downscale > 1 and not run.exists:
-        width, height = read_scene(config).cameras.size[0].tolist()
+        width, height = scene_at_size(config, whole).cameras.size[0].tolist()
         if min(width, height) < _SMALL:
             display.say(
                 f"warning: {width}x{height} pixels are few: --downscale {config.downscale:g} counts from the images as they "
@@ -420,20 +424,19 @@ def _sized(run: Run, config: RunConfig, display: Display) -> RunConfig:
                 decided[name] = getattr(old, name, None)
         config = replace(config, **{name: value for name, value in decided.items() if value is not None})
     if any(getattr(config, name) is None for name in config.open):
-        scene = read_scene(replace(config, downscale=1))
-        config = planned(config, scene)
-        sizes = scene.cameras.scaled(config.downscale or 1).size
-        width, height = sizes[scene.train[0] if len(scene.train) else 0].tolist()
+        config = planned(config, whole)
+        sizes = whole.cameras.scaled(config.downscale or 1).size
+        width, height = sizes[whole.train[0] if len(whole.train) else 0].tolist()
         if config.minutes is not None:
             ends = f"{config.minutes:g} minutes"
         else:
-            ends = f"{config.limited(len(scene.train)):,} steps"
+            ends = f"{config.limited(len(whole.train)):,} steps"
         if config.downscale != 1:
             reduced = f" (1/{config.downscale:.3g}; --downscale 1 keeps them whole)"
         else:
             reduced = ""
         display.say(
-            f"plan: {len(scene.train)} views at {width}x{height}{reduced}{config.described()}, {ends}"
+            f"plan: {len(whole.train)} views at {width}x{height}{reduced}{config.described()}, {ends}"
         )
     return config
 

@@ -43,7 +43,7 @@ def planned(config: RunConfig, whole: ParsedScene | None = None) -> RunConfig:
     """
     if all(getattr(config, name) is not None for name in config.open):
         return config
-    return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.trained_on))
+    return config.planned(whole or read_whole_scene(config), device_of(config.trained_on))
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
@@ -51,11 +51,22 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
 
     Raises UsageError where it names none, DataError where that cannot be read.
     """
+    whole = read_whole_scene(config)
+    sized = planned(config, whole) if config.downscale is None else config
+    return scene_at_size(sized, whole, saved)
+
+
+def read_whole_scene(config: RunConfig) -> ParsedScene:
+    """The scene of a config at its own size. Raises as `read_scene`."""
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    scene = parse_scene(config.data, config.downscale or 1, config.scene_parser)
-    if config.downscale is None and (size := planned(config, scene).downscale or 1) != 1:
-        scene = replace(scene, cameras=scene.cameras.scaled(size))
+    return parse_scene(config.data, 1, config.scene_parser)
+
+
+def scene_at_size(config: RunConfig, whole: ParsedScene, saved: Facts | None = None) -> ParsedScene:
+    """A scene that was read at its own size, at that of a planned config, about the origin of a run that goes on."""
+    size = config.downscale or 1
+    scene = whole if size == 1 else replace(whole, cameras=whole.cameras.scaled(size))
     return scene if saved is None else at_origin(scene, saved.origin)
 
 

@@ -1,6 +1,7 @@
 """`fprf doctor`: methods and caches, its test of a device, and what it finds in scene folders."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -220,3 +221,35 @@ def test_damaged_images_are_named(tmp_path: Path) -> None:
         "06.png" in _by_name(scene_folder(folder))["images"].found
         and not _by_name(scene_folder(folder))["images"].optional
     )
+
+
+def save_picture(path: Path, grey: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((12, 16, 3), grey, np.uint8)).save(path)
+
+
+def test_what_will_be_left_out_of_photographs_is_named(tmp_path: Path) -> None:
+    for k in range(4):
+        for name in (f"{k}.png", f"{k} (1).png", f"Thumbs/{k}.png"):
+            save_picture(tmp_path / name, 40 * k)
+    save_picture(tmp_path / "masks" / "0.png", 0)
+    found = [finding.found for finding in scene_folder(tmp_path) if finding.what in ("note", "images")]
+    assert found[0].startswith("4 ")
+    assert sorted(line.split(": ")[1].split(" ")[0] for line in found[1:]) == ["1", "4", "4"]
+    assert any("Thumbs/0.png" in line for line in found) and any("0 (1).png" in line for line in found)
+
+
+def test_what_a_scene_leaves_out_scales_and_lacks_is_named(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path)
+    content = json.loads((scene / "transforms.json").read_text())
+    first = content["frames"][0]
+    original = scene / first["file_path"]
+    shutil.copy(original, original.with_name("copy of it.png"))
+    content["frames"].append({**first, "file_path": f"{original.parent.name}/copy of it.png"})
+    (scene / "transforms.json").write_text(json.dumps(content))
+    (scene / "points.npz").unlink()
+    save_picture(scene / "masks" / "who.png", 0)
+    found = list(scene_folder(scene))
+    assert any("copy of it.png" in finding.found for finding in found if finding.what == "note")
+    (masks,) = (finding for finding in found if finding.what == "masks")
+    assert "who.png" in masks.found and masks.remedy and not masks.optional

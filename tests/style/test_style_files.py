@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from tiny_world import World
 
 from fprf.errors import ConfigError, DataError, UsageError
@@ -276,3 +277,33 @@ def test_a_photograph_may_be_named_twice_beside_a_folder_that_holds_it(world: Wo
     )
     assert style.references == (tmp_path / "snow.png", dusk, dusk)
     assert style.weights == (1, 2, 3) and style.masks == (NO_MASK, sky, NO_MASK)
+
+
+@pytest.mark.parametrize("template", ["{stem}_mask.png", "mask_{stem}.PNG", "{name}.png", "{stem}.png.png"])
+def test_a_folder_of_masks_is_searched_by_the_references_names(tmp_path: Path, template: str) -> None:
+    names = ("dusk.jpg", "snow.jpg")
+    paths = tuple(tmp_path / "photos" / name for name in names)
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (6, 4), (99, 9, 9)).save(path)
+    covers = []
+    for name in names:
+        covers.append(photo(tmp_path / "covers" / template.format(stem=name.removesuffix(".jpg"), name=name)))
+    for references in (paths, (tmp_path / "photos",)):
+        style = with_folders(StyleConfig(references=references, masks=(tmp_path / "covers",)))
+        assert style.references == paths and style.masks == tuple(covers)
+    one = with_folders(StyleConfig(references=paths, masks=(NO_MASK, tmp_path / "covers")))
+    assert one.masks == (NO_MASK, covers[1])
+
+
+def test_what_of_a_folder_of_masks_does_not_fit_is_said(tmp_path: Path) -> None:
+    paths = tuple(photo(tmp_path / name) for name in ("dusk.jpg", "snow.jpg"))
+    cover = photo(tmp_path / "covers" / "dusk.png")
+    told: list[str] = []
+    style = with_folders(StyleConfig(references=paths, masks=(tmp_path / "covers",)), told.append)
+    assert style.masks == (cover, NO_MASK) and len(told) == 1 and "snow.jpg" in told[0]
+    cover.rename(cover.with_name("noon.png"))
+    with pytest.raises(ConfigError, match=r"masks: .*none of its 1 images, like noon\.png"):
+        with_folders(StyleConfig(references=paths, masks=(tmp_path / "covers",)))
+    with pytest.raises(ConfigError, match="1 masks for 2 references"):
+        with_folders(StyleConfig(references=paths, masks=(cover,)))

@@ -125,8 +125,9 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
     camera = shot.camera
     longest = max(width, height)
     # Another size is fine, another shape means that the photographs were cropped or turned.
-    own = camera.number("width"), camera.number("height")
-    if None not in own and abs((own[0] or 0) * height - (own[1] or 0) * width) > 2 * longest:
+    wide = camera.number("width")
+    tall = camera.number("height")
+    if wide is not None and tall is not None and abs(wide * height - tall * width) > wide + tall:
         raise DataError(f"{path}: {width}x{height} pixels is not the shape of its camera; restore the image")
     # The lens, and the focal lengths in pixels: OpenSfM's unit is the longer side.
     kind = camera.text("projection_type") or "perspective"
