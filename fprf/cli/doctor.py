@@ -8,7 +8,8 @@ import platform
 import shlex
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 _BYTES_PER_MIB = 1 << 20
 """For sizes in messages."""
+_MAX_VIDEO_SECONDS = 30.0
+"""Time for which a video is read: some minutes of it. By eye."""
 _MIN_DISK_BYTES = 1 << 30
 """Free bytes below which a training may fail for want of room: features and checkpoints of a small scene. By eye."""
 _MAX_OPENED_VIEWS = 48
@@ -51,7 +54,7 @@ class DoctorConfig:
     """Settings of `fprf doctor`."""
 
     target: Path | None = None
-    """A scene folder or a method; none = this machine."""
+    """A scene folder, photographs, a video, or a method; none = this machine."""
     device: str = "auto"
     """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
@@ -88,6 +91,8 @@ def run(args: list[str]) -> int:
         findings = chain(machine(), self_test(config.device))
     elif str(target) in registry.installed("fprf.methods"):
         findings = method_needs(str(target))
+    elif _is_video(target):
+        findings = video_file(target)
     else:
         findings = scene_folder(target)
     console = Console(highlight=False)
@@ -104,6 +109,15 @@ def run(args: list[str]) -> int:
         if finding.remedy:
             console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
     return int(bad)
+
+
+def _is_video(path: Path) -> bool:
+    """True for a file that is called as videos are."""
+    if not path.is_file():
+        return False
+    from ..io.video_reader import VIDEO_SUFFIXES
+
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def machine() -> Iterator[Finding]:
@@ -253,10 +267,10 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     try:
         parser = recognise(data)
     except DataError:
-        found = find_photographs(data) if data.is_dir() else None
-        if found is None or not found.files:
+        photographs = find_photographs(data) if data.is_dir() else None
+        if photographs is None or not photographs.files:
             raise
-        yield from photographs_without_poses(data, found)
+        yield from photographs_without_poses(data, photographs)
         return
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
     scene = parse_scene(data, 1, parser)
@@ -328,4 +342,57 @@ def photographs_without_poses(data: Path, photographs: "Photographs") -> Iterato
         notes.append(left_out_note(COPIES, names))
     for note in notes:
         yield Finding("note", note)
+    yield from lenses_of(data, files)
     yield Finding("next", f"fprf process {shlex.quote(str(data))}")
+
+
+def lenses_of(data: Path, files: Sequence[Path]) -> Iterator[Finding]:
+    """What the photographs of a folder say of their lenses."""
+    from ..datamanagers.image_files import read_header
+    from ..reconstruction.images import read_encoder, read_lens
+    from ..reconstruction.lenses import unsaid_sentence
+
+    images = {}
+    for path in files:
+        with suppress(DataError):  # of what cannot be read another line tells
+            header = read_header(path)
+            images[path.relative_to(data).as_posix()] = {
+                "width": header.width,
+                "height": header.height,
+                "lens": read_lens(path),
+                "encoder": read_encoder(path),
+            }
+    if told := unsaid_sentence(images):
+        yield Finding("lenses", told)
+
+
+def video_file(path: Path) -> Iterator[Finding]:
+    """How much of a video can be read, and what `fprf process` will make of its colours and pixels. Raises
+    DataError where it cannot be opened.
+    """
+    from ..io.video_reader import read_video
+
+    log, frames = read_video(path)
+    start = time.perf_counter()
+    whole = True
+    for frame in frames:
+        if log.read == 1:
+            height, width = frame.picture().shape[:2]
+            yield Finding("format", f"video of {width} x {height} pixels")
+        if time.perf_counter() - start > _MAX_VIDEO_SECONDS:
+            whole = False
+            break
+    if not log.read:
+        remedy = "convert it to H.264 in an .mp4, or copy it from the camera again"
+        yield Finding("frames", "none can be decoded", remedy)
+        return
+    if whole:
+        remedy = "copy it from the camera again; what can be read is used" if log.missing else ""
+        yield Finding("frames", log.sentence(), remedy, optional=True)
+    else:
+        yield Finding(
+            "frames", f"the first {log.read} of {log.expected} were read, {log.damaged} cannot be decoded"
+        )
+    for note in log.notes:
+        yield Finding("note", note)
+    yield Finding("next", f"fprf process {shlex.quote(str(path))}")

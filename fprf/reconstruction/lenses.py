@@ -90,6 +90,18 @@ def unsaid_lenses(images: Images) -> list[str]:
     return [name for name in unsaid if count[labels[name]] >= 2 * MIN_IMAGES_OF_LENS]
 
 
+def unsaid_sentence(images: Images) -> str:
+    """What is not known of the lenses of images without EXIF, in one line; empty where all say theirs."""
+    unsaid = unsaid_lenses(images)
+    if not unsaid:
+        return ""
+    hints = [grouping.reason for grouping in hinted_groupings(images)]
+    told = f"{len(unsaid)} of {len(images)} photographs say no focal length"
+    if hints:
+        return f"{told}, and their {' and '.join(hints)} hint at several cameras: residuals will tell"
+    return f"{told}: those of one size share a lens, unless residuals tell them apart"
+
+
 def own_lenses(images: Images) -> Grouping:
     """A lens for each image whose file says no focal length."""
     labels = shared_lenses(images)
