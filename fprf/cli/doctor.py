@@ -8,7 +8,8 @@ import platform
 import shlex
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 _BYTES_PER_MIB = 1 << 20
 """For sizes in messages."""
+_MAX_VIDEO_SECONDS = 30.0
+"""Time for which a video is read: some minutes of it. By eye."""
 _MIN_DISK_BYTES = 1 << 30
 """Free bytes below which a training may fail for want of room: features and checkpoints of a small scene. By eye."""
 _MAX_OPENED_VIEWS = 48
@@ -52,7 +55,7 @@ class DoctorConfig:
     """Settings of `fprf doctor`."""
 
     target: Path | None = None
-    """A scene folder, a capture of 3D Gaussians or a method; none = this machine."""
+    """A scene folder, photographs, a video, a capture of 3D Gaussians, or a method; none = this machine."""
     device: str = "auto"
     """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
@@ -92,6 +95,8 @@ def run(args: list[str]) -> int:
         findings = method_needs(str(target))
     elif is_scene(target) and not (target / "config.json").is_file():
         findings = capture_file(target)
+    elif _is_video(target):
+        findings = video_file(target)
     else:
         findings = scene_folder(target)
     console = Console(highlight=False)
@@ -108,6 +113,15 @@ def run(args: list[str]) -> int:
         if finding.remedy:
             console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
     return int(bad)
+
+
+def _is_video(path: Path) -> bool:
+    """True for a file that is called as videos are."""
+    if not path.is_file():
+        return False
+    from ..io.video_reader import VIDEO_SUFFIXES
+
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def machine() -> Iterator[Finding]:
@@ -358,4 +372,57 @@ def photographs_without_poses(data: Path, photographs: "Photographs") -> Iterato
         notes.append(left_out_note(COPIES, names))
     for note in notes:
         yield Finding("note", note)
+    yield from lenses_of(data, files)
     yield Finding("next", f"fprf process {shlex.quote(str(data))}")
+
+
+def lenses_of(data: Path, files: Sequence[Path]) -> Iterator[Finding]:
+    """What the photographs of a folder say of their lenses."""
+    from ..datamanagers.image_files import read_header
+    from ..reconstruction.images import read_encoder, read_lens
+    from ..reconstruction.lenses import unsaid_sentence
+
+    images = {}
+    for path in files:
+        with suppress(DataError):  # of what cannot be read another line tells
+            header = read_header(path)
+            images[path.relative_to(data).as_posix()] = {
+                "width": header.width,
+                "height": header.height,
+                "lens": read_lens(path),
+                "encoder": read_encoder(path),
+            }
+    if told := unsaid_sentence(images):
+        yield Finding("lenses", told)
+
+
+def video_file(path: Path) -> Iterator[Finding]:
+    """How much of a video can be read, and what `fprf process` will make of its colours and pixels. Raises
+    DataError where it cannot be opened.
+    """
+    from ..io.video_reader import read_video
+
+    log, frames = read_video(path)
+    start = time.perf_counter()
+    whole = True
+    for frame in frames:
+        if log.read == 1:
+            height, width = frame.picture().shape[:2]
+            yield Finding("format", f"video of {width} x {height} pixels")
+        if time.perf_counter() - start > _MAX_VIDEO_SECONDS:
+            whole = False
+            break
+    if not log.read:
+        remedy = "convert it to H.264 in an .mp4, or copy it from the camera again"
+        yield Finding("frames", "none can be decoded", remedy)
+        return
+    if whole:
+        remedy = "copy it from the camera again; what can be read is used" if log.missing else ""
+        yield Finding("frames", log.sentence(), remedy, optional=True)
+    else:
+        yield Finding(
+            "frames", f"the first {log.read} of {log.expected} were read, {log.damaged} cannot be decoded"
+        )
+    for note in log.notes:
+        yield Finding("note", note)
+    yield Finding("next", f"fprf process {shlex.quote(str(path))}")

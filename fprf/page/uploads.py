@@ -26,8 +26,8 @@ from ..datamanagers.image_files import kind_of
 from ..datamanagers.images import IMAGE_SUFFIXES
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, FprfError, UsageError
+from ..io.video_reader import VIDEO_SUFFIXES
 from ..plugins.captures import endings, format_name
-from ..reconstruction.images import VIDEO_SUFFIXES
 
 MAX_BYTES = 20 << 20
 """Bytes of a photograph."""
@@ -307,15 +307,21 @@ def check_file(name: str, head: bytes, size: int) -> None:
         ".npz": head.startswith(b"PK"),
         ".npy": head.startswith(b"\x93NUMPY"),
         ".json": head.lstrip()[:1] in (b"{", b"["),
-        **dict.fromkeys(
-            VIDEO_SUFFIXES, head[4:8] in _ATOMS or head[8:11] == b"AVI" or head.startswith(b"\x1aE\xdf\xa3")
-        ),
+        **dict.fromkeys(VIDEO_SUFFIXES, _begins_video(head)),
         **dict.fromkeys((".bin", ".txt") if stem in _MODEL else (), True),
     }
     if suffix not in whole:
         raise DataError(f"{name}: cannot become a scene; give {_kinds()}")
     if not whole[suffix]:
         raise DataError(f"{name}: damaged, or no {suffix} file; export it again")
+
+
+def _begins_video(head: bytes) -> bool:
+    """True for the first bytes of MP4, QuickTime, AVI, Matroska, an MPEG program or transport stream."""
+    if head[4:8] in _ATOMS or head[8:11] == b"AVI" or head.startswith((b"\x1aE\xdf\xa3", b"\0\0\1\xba")):
+        return True
+    # Packets of a transport stream begin with G, those of cameras after a time of four bytes.
+    return b"G" in (head[:1], head[4:5])
 
 
 class SceneFiles:

@@ -2,11 +2,6 @@
 again.
 
 Features and matches go into a database as they are found: a step that was cut off goes on where it stood.
-
-Which images look alike is told before they are matched by one vector each (VLAD, Jégou et al., 2010), from a
-vocabulary of the scene's own features: descriptors are assigned to visual words, k-means centres of a sample
-of all; the differences to the centres are summed word by word, tamed by a square root and scaled to length 1,
-word by word and altogether.
 """
 
 import contextlib
@@ -18,137 +13,65 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
-
-import cv2
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json, write_text
 from .config import SfmConfig
 from .images import lost_files
-from .scene_folder import MatchTables, Progress, SceneFolder, State, count_rows, reading, step_key
+from .lenses import (
+    MIN_IMAGES_OF_LENS,
+    MIN_LOST_SHARE,
+    Grouping,
+    Trial,
+    better_models,
+    choose_trial,
+    clustered_groupings,
+    hinted_groupings,
+    lens_sentence,
+    own_lenses,
+    shared_lenses,
+    unsaid_lenses,
+)
+from .motion import still_share
+from .pairs import (
+    VISUAL_WORDS,
+    Descriptors,
+    build_vocabulary,
+    descriptors,
+    sequential_pairs,
+    similar_pairs,
+    vlad_vectors,
+)
+from .scene_folder import MatchTables, Progress, SceneFolder, State, count_rows, step_key
 from .worker import NO_MODEL, NO_PYCOLMAP
 
-Pair: TypeAlias = tuple[int, int]
-Descriptors = Annotated[NDArray[np.uint8], "N 128"]
-Words = Annotated[NDArray[np.float32], "W 128"]
-Reader = Callable[[int], Descriptors]
-
-_SAMPLE = 40_000
-_MOST = 2000
-"""Descriptors that the words are made of, and evenly taken ones of an image that its vector is made of, at
-most.
-"""
-_ROUNDS = 12
-"""Rounds of k-means, at most."""
-_ALL_PAIRS = 120
-"""Images up to which `auto` matches all with all."""
-_WORDS = 64
-_POLL = 0.2
+_MAX_EXHAUSTIVE_IMAGES = 120
+"""Images up to which `auto` matches all with all: 7000 pairs, minutes on a few cores."""
+_ORDER_NEIGHBOURS = 2
+"""Neighbours by name that photographs are matched with beside those that look alike: where things look alike
+everywhere they help."""
+_WORKER_POLL_SECONDS = 0.2
 """Seconds between looks at a running step."""
-_TITLES = {"features": "finding features", "matches": "matching", "mapping": "finding poses"}
+_MAX_LAST_WORDS = 200
+"""Characters of COLMAP's last line that an error repeats."""
+_MIN_STILL_SHARE = 0.5
+"""Share of the matched pairs that stand still from which on it is said: of a turntable before a background nearly
+all do, of a walk none. By eye."""
+_TITLES = {
+    "features": "finding features",
+    "matches": "matching",
+    "mapping": "finding poses",
+    "lenses": "comparing lenses",
+}
 _COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
-
-
-def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
-    """SIFT descriptors [N 128] of an image; none for an image without."""
-    with reading(path) as base:
-        row = base.execute(
-            "SELECT rows, cols, data FROM descriptors JOIN images USING (image_id) WHERE name = ?", (name,)
-        ).fetchone()
-    if row is None or not row[0]:
-        return np.zeros((0, 128), np.uint8)
-    return np.frombuffer(row[2], np.uint8).reshape(row[0], row[1])
-
-
-def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Each with the next `overlap` ones, and with those at distances 2, 4, 8, ... up to 2 ** overlap."""
-    steps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
-    found: list[Pair] = []
-    for a in range(count):
-        for step in steps:
-            if a + step < count:
-                found.append((a, a + step))
-    return found
-
-
-def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
-    """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0)
-    with none.
-    """
-    # Cosines, without those of images with themselves and of images that nothing is known of.
-    likeness = vectors @ vectors.T
-    empty = ~vectors.any(axis=1)
-    likeness[empty] = likeness[:, empty] = -np.inf
-    np.fill_diagonal(likeness, -np.inf)
-    count = min(nearest, max(0, len(vectors) - 1))
-    best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
-    pairs = set()
-    for a, row in enumerate(best.tolist()):
-        for b in row:
-            if np.isfinite(likeness[a, b]):
-                pairs.add((min(a, b), max(a, b)))
-    return sorted(pairs)
-
-
-def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Words:
-    """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of
-    `count`.
-    """
-    # A sample of all descriptors, as many of each image.
-    rng = np.random.default_rng(seed)
-    each = max(1, _SAMPLE // max(1, count))
-    parts = []
-    for image in range(count):
-        features = read(image)
-        parts.append(features[rng.permutation(len(features))[:each]])
-    if parts:
-        sample = np.concatenate(parts).astype(np.float32)
-    else:
-        sample = np.zeros((0, 128), np.float32)
-    if len(sample) <= number:
-        return sample
-    # cv2 draws from a generator of its own.
-    stop = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, _ROUNDS, 1e-3)
-    cv2.setRNGSeed(seed)
-    start = rng.permutation(len(sample))[:number]
-    # k-means begins with some of the descriptors as centres: cv2 takes them as the labels of all.
-    labels = np.argmin(_distances(sample, sample[start]), axis=1).astype(np.int32)[:, None]
-    centres = cv2.kmeans(sample, number, labels, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)[2]
-    return np.asarray(centres, dtype=np.float32)
-
-
-def vlad_vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArray[np.float32], "V X"]:
-    """A unit vector an image; 0 for an image without descriptors."""
-    result = np.zeros((count, vocabulary.size), np.float32)
-    for image in range(count):
-        features = read(image)
-        some = features[:: -(-len(features) // _MOST) or 1].astype(np.float32)
-        if not len(some) or not len(vocabulary):
-            continue
-        # Differences to the nearest word, summed word by word, tamed, and scaled to length 1 word by word and
-        # altogether.
-        nearest = np.argmin(_distances(some, vocabulary), axis=1)
-        sums = np.zeros_like(vocabulary)
-        np.add.at(sums, nearest, some - vocabulary[nearest])
-        sums = np.sign(sums) * np.sqrt(np.abs(sums))
-        sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-        flat = sums.reshape(-1)
-        result[image] = flat / max(float(np.linalg.norm(flat)), 1e-12)
-    return result
-
-
-def _distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Squared distances less a constant of each row."""
-    distances: NDArray[np.float32] = (b * b).sum(1)[None] - 2 * (a @ b.T)
-    return distances
 
 
 def find_features(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
     """Features of every image; those of an image that has changed or gone take all others with them."""
-    settings = [config.lens, config.cameras, config.features, config.side, config.seed]
+    settings: list[Any] = [config.lens, config.cameras, config.features, config.side, config.seed]
+    if state.masks:
+        settings.append(state.masks)
     hashes = {name: image["sha256"] for name, image in state.images.items()}
     # Images may be added to those of before; other settings, or an image that has changed, begin anew.
     before: Any = None
@@ -165,17 +88,18 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
     # From now on the database is of these images: a step that is cut off goes on with them.
     write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
     # Images of one size and lens share a camera, unless each is to have its own.
+    lenses = shared_lenses(state.images)
     groups: dict[str, list[str]] = {}
-    for name, image in state.images.items():
-        shared = config.cameras == "shared"
-        alike = [image["width"], image["height"], image["lens"]] if shared else name
-        groups.setdefault(json.dumps(alike), []).append(name)
+    for name in state.images:
+        alike = name if config.cameras == "each" else lenses[name]
+        groups.setdefault(alike, []).append(name)
     job = {
         "step": "features",
         "groups": list(groups.values()),
         "lens": config.lens.upper().replace("-", "_"),
         "features": config.features,
         "side": config.side,
+        "masks": str(place.masks) if state.masks else "",
     }
     _run(place, state, config, job, lambda: count_rows(place.database)[0], len(state.images), progress)
     state.done["features"] = key
@@ -188,7 +112,7 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     video = "frames" in state.done
     kind = config.matching
     if kind == "auto":
-        kind = "exhaustive" if len(names) <= _ALL_PAIRS else "similar"
+        kind = "exhaustive" if len(names) <= _MAX_EXHAUSTIVE_IMAGES else "similar"
     key = step_key(state.done["features"], kind, config.overlap, config.neighbours)
     if state.done.get("matches") == key and place.database.is_file():
         return kind
@@ -200,12 +124,14 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     else:
         # Neighbours by name help where things look alike everywhere; in a video they are neighbours for
         # certain.
-        near = sequential_pairs(len(names), config.overlap if video else 2)
+        near = sequential_pairs(len(names), config.overlap if video else _ORDER_NEIGHBOURS)
 
         def read(image: int) -> Descriptors:
             return descriptors(place.database, names[image])
 
-        vectors = vlad_vectors(read, len(names), build_vocabulary(read, len(names), _WORDS, config.seed))
+        vectors = vlad_vectors(
+            read, len(names), build_vocabulary(read, len(names), VISUAL_WORDS, config.seed)
+        )
         chosen = sorted({*near, *similar_pairs(vectors, config.neighbours)})
     listed = place.work / "pairs.txt"
     write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
@@ -226,18 +152,14 @@ def find_poses(
     described = place.work / "models" / "models.json"
     if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
         return list(json.loads(described.read_text(encoding="utf-8")))
-    shutil.rmtree(described.parent, ignore_errors=True)
-
-    def registered() -> int:
-        """Images with a pose so far: a line for each but the first."""
-        lines = []
-        for line in place.progress.read_text(encoding="utf-8").splitlines():
-            if line.startswith("{"):
-                lines.append(line)
-        return len(lines) + 1 if lines else 0
-
-    job = {"step": "mapping", "models": str(described.parent)}
-    _run(place, state, config, job, registered, len(state.images), progress)
+    for old in (described.parent, place.work / "models_each", place.work / "models_lenses"):
+        shutil.rmtree(old, ignore_errors=True)
+    state.seconds.pop("mapping", None)
+    state.seconds.pop("lenses", None)
+    state.notes.pop("lenses", None)
+    models = _map(place, state, config, progress, described.parent)
+    if config.cameras == "shared":
+        models = _with_lenses_told_apart(place, state, config, progress, models)
     # The model appears as a whole: copied beside its place, and renamed.
     fresh = place.root / "sparse" / ".fresh"
     shutil.rmtree(fresh, ignore_errors=True)
@@ -246,7 +168,121 @@ def find_poses(
     fresh.rename(place.model)
     state.done["mapping"] = key
     state.save(place)
-    return list(json.loads(described.read_text(encoding="utf-8")))
+    return models
+
+
+def _map(
+    place: SceneFolder,
+    state: State,
+    config: SfmConfig,
+    progress: Progress,
+    out: Path,
+    trial: Trial | None = None,
+) -> list[dict[str, Any]]:
+    """Reconstruct into a folder, with the lenses of a trial where one is given; the models described, the
+    largest first.
+    """
+
+    def registered() -> int:
+        """Images with a pose so far: a line for each but the first."""
+        lines = 0
+        for line in place.progress.read_text(encoding="utf-8").splitlines():
+            lines += line.startswith("{")
+        return lines + 1 if lines else 0
+
+    lenses: dict[str, str] = {}
+    focal: dict[str, float] = {}
+    if trial is not None:
+        lenses = trial.grouping.lenses
+        for name, value in trial.focal.items():
+            focal[lenses[name]] = value
+    job = {"step": "mapping", "models": str(out), "lenses": lenses, "focal": focal}
+    _run(place, state, config, job, registered, len(state.images), progress)
+    return list(json.loads((out / "models.json").read_text(encoding="utf-8")))
+
+
+def _with_lenses_told_apart(
+    place: SceneFolder,
+    state: State,
+    config: SfmConfig,
+    progress: Progress,
+    models: list[dict[str, Any]],
+) -> list[dict[str, Any]]:
+    """The models, or better ones with more lenses where residuals tell that images of one size have several.
+
+    A reconstruction that is there is kept, whatever happens here.
+    """
+    if not unsaid_lenses(state.images):
+        return models
+    main = place.work / "models"
+    each = place.work / "models_each"
+    told = place.work / "models_lenses"
+    try:
+        # A lens that is far from the others' is not posed at all by theirs: then each image gets its own first,
+        # which is no result (focal lengths run away) but tells them apart.
+        start = main
+        if _lost_by_lens(place, state, models):
+            own = Trial(grouping=own_lenses(state.images), error=0.0, focal={})
+            if better_models(models, _map(place, state, config, progress, each, own)):
+                start = each
+        trial = _compare_lenses(place, state, config, progress, start)
+        if trial.grouping.lenses == shared_lenses(state.images):
+            return models
+        finer = _map(place, state, config, progress, told, trial)
+        if not better_models(models, finer):
+            return models
+        shutil.rmtree(main)
+        told.rename(main)
+        state.notes["lenses"] = [lens_sentence(trial, models[0], finer[0])]
+        return finer
+    except DataError as error:
+        state.notes["lenses"] = [f"lenses could not be compared, images of one size share one: {error}"]
+        return models
+    finally:
+        shutil.rmtree(each, ignore_errors=True)
+        shutil.rmtree(told, ignore_errors=True)
+
+
+def _lost_by_lens(place: SceneFolder, state: State, models: list[dict[str, Any]]) -> bool:
+    """True where many images find matches but no pose, and their lenses may be others."""
+    posed = set(models[0]["images"])
+    partners = MatchTables(place.database).partners
+    lost = 0
+    for name in unsaid_lenses(state.images):
+        lost += name not in posed and partners[name] > 0
+    return lost >= max(MIN_IMAGES_OF_LENS, MIN_LOST_SHARE * len(state.images))
+
+
+def _compare_lenses(
+    place: SceneFolder, state: State, config: SfmConfig, progress: Progress, models: Path
+) -> Trial:
+    """How the images of the main one of some models are best grouped by lens."""
+    result = place.work / "lenses.result.json"
+
+    def solved() -> int:
+        return place.progress.read_text(encoding="utf-8").count("{")
+
+    def tried(groupings: list[Grouping]) -> list[Trial]:
+        """Groupings after bundle adjustment."""
+        job = {
+            "step": "lenses",
+            "model": str(models / "best"),
+            "groupings": [grouping.lenses for grouping in groupings],
+            "result": str(result),
+        }
+        _run(place, state, config, job, solved, len(groupings), progress)
+        trials = []
+        found = json.loads(result.read_text(encoding="utf-8"))
+        for grouping, row in zip(groupings, found, strict=True):
+            trials.append(Trial(grouping=grouping, error=row["error"], focal=row["focal"]))
+        return trials
+
+    shared = Grouping(lenses=shared_lenses(state.images), reason="size")
+    trials = tried([shared, own_lenses(state.images)])
+    groupings = hinted_groupings(state.images) + clustered_groupings(state.images, trials[1].focal)
+    if groupings:
+        trials += tried(groupings)
+    return choose_trial(trials)
 
 
 def _run(
@@ -279,7 +315,7 @@ def _run(
             while process.poll() is None:
                 progress(max(0, min(total - 1, count())), total, what)
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(_POLL)
+                    process.wait(_WORKER_POLL_SECONDS)
         finally:
             if process.poll() is None:
                 process.terminate()
@@ -291,29 +327,41 @@ def _run(
             "fprf process: pycolmap 4 or newer is needed; install it with: pip install 'pycolmap>=4'"
         )
     if code == NO_MODEL:
-        # What the decoders lost comes first: it may be all that is wrong.
-        unread = sorted(set(state.images) - set(MatchTables(place.database).features))
-        if unread:
-            missed = (
-                f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}"
-            )
-        else:
-            missed = ""
-        lost = "; ".join(filter(None, [lost_files(state), missed]))
-        if lost:
-            rest = "no two of the other images fit together"
-        else:
-            rest = "no two images fit together"
-        raise DataError(
-            f"{place.root}: {f'{lost}; ' if lost else ''}{rest}; take more views with more overlap, of places with texture "
-            f"({place.log} has COLMAP's words)"
-        )
+        raise _nothing_fits(place, state)
     if code:
         lines = []
         for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.strip():
                 lines.append(line)
-        last = lines[-1].strip()[-200:] if lines else "nothing was said"
+        last = lines[-1].strip()[-_MAX_LAST_WORDS:] if lines else "nothing was said"
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {last}; {place.log} has the rest")
     progress(total, total, what)
-    state.seconds[name] = round(time.perf_counter() - start, 2)
+    before = 0.0 if name in ("features", "matches") else state.seconds.get(name, 0.0)
+    state.seconds[name] = round(before + time.perf_counter() - start, 2)
+
+
+def _nothing_fits(place: SceneFolder, state: State) -> DataError:
+    """Error for images of which no two fit together, with what is known of the reason."""
+    # What the decoders lost comes first: it may be all that is wrong.
+    unread = sorted(set(state.images) - set(MatchTables(place.database).features))
+    lost = []
+    if told := lost_files(state):
+        lost.append(told)
+    if unread:
+        lost.append(
+            f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}"
+        )
+    if not lost and still_share(place.database) >= _MIN_STILL_SHARE:
+        return DataError(
+            f"{place.root}: all images fit together, but what they share stands still: seen from the background "
+            "the camera never moved, as with an object on a turntable; give masks that are black on the background with "
+            "--masks FOLDER (and another --output), or walk around with the camera"
+        )
+    if lost:
+        rest = "no two of the other images fit together"
+    else:
+        rest = "no two images fit together"
+    return DataError(
+        f"{place.root}: {'; '.join([*lost, rest])}; take more views with more overlap, of places with texture "
+        f"({place.log} has COLMAP's words)"
+    )

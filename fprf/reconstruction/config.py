@@ -1,6 +1,7 @@
 """How poses are found: the knobs of `fprf process`. No cv2, no torch."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from ..checks import at_least, between
@@ -22,7 +23,13 @@ class SfmConfig:
     lens: Lens = "simple-radial"
     """Lens model that is fitted; wide-angle and action cameras want opencv or opencv-fisheye."""
     cameras: Literal["shared", "each"] = "shared"
-    """shared: images of one size, model and focal length have one lens; each: every image has its own."""
+    """shared: images of one size, model and focal length have one lens; where their files say no focal length,
+    several if residuals tell them apart. each: every image has its own.
+    """
+    masks: Path | None = None
+    """A folder of masks with the images' names, black where nothing is to be used: the still background of a
+    turntable, passers-by. They go into the scene, and training uses them too.
+    """
     features: int = 8192
     """Features of an image, at most."""
     side: int = 1600

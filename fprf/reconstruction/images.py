@@ -8,7 +8,7 @@ edges first. It depends on what is shown, so frames are compared with their neig
 import hashlib
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +20,7 @@ import PIL.Image
 from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 
-from ..datamanagers.images import IMAGE_SUFFIXES, Image, exif_of, load_image, read_header
+from ..datamanagers.images import IMAGE_SUFFIXES, exif_of, load_image, open_image, read_header
 from ..datamanagers.photograph_files import (
     COPIES,
     digest_of_pixels,
@@ -30,34 +30,31 @@ from ..datamanagers.photograph_files import (
 )
 from ..errors import DataError, UsageError
 from ..io.atomic import write_bytes
+from ..io.video_reader import VIDEO_SUFFIXES, Grey, read_video
 from .config import SfmConfig
 from .scene_folder import Progress, SceneFolder, State, step_key
 
-_SIDE = 960
+_SHARPNESS_SIDE_PIXELS = 960
 """Longest side at which sharpness is measured: finer detail is mostly noise, and larger images take long."""
-_NEIGHBOURS = 2
-"""Windows on each side that a window's best frame is compared with."""
-
-
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
-"""Suffixes of videos, in lower case."""
-_FRAME = "frame_{:06d}.jpg"
-_QUALITY = 95
-"""File of a frame, and its quality as JPEG."""
-_FEWEST = 3
-"""Images that a scene needs at least."""
-_FOREIGN = frozenset({"WebP", "AVIF", "HEIC", "raw"})
+_WINDOWS_AROUND = 2
+"""Windows on each side that a window's best frame is compared with. By eye."""
+_FRAME_NAME = "frame_{:06d}.jpg"
+"""File of a frame, by its number among those that can be decoded."""
+_FRAME_QUALITY = 95
+"""Quality of a frame as JPEG: what a phone saves photographs with."""
+_MIN_IMAGES = 3
+"""Images that a scene needs: COLMAP keeps no smaller models (`worker.py`)."""
+_UNREAD_BY_COLMAP = frozenset({"WebP", "AVIF", "HEIC", "raw"})
 """Formats that COLMAP does not read, as it is packaged. It tells formats by their content, as we do."""
-_EXIF_BYTES = (1 << 16) - 16
-"""Bytes of an EXIF block that a JPEG takes."""
-_NAMED = 3
-"""Files, or reasons, that a sentence names, at most."""
+_MAX_EXIF_BYTES = (1 << 16) - 16
+"""Bytes of an EXIF block that a JPEG takes: a segment has 16 bits of length, and its own head."""
+_MAX_NAMED_FILES = 3
+"""Files, or reasons, that a sentence names."""
 
 
-def sharpness(image: Image) -> float:
-    """Variance of the Laplacian of an RGB image [H W 3]; 0 for an even one."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    scale = _SIDE / max(grey.shape)
+def sharpness(grey: Grey) -> float:
+    """Variance of the Laplacian of a grey image; 0 for an even one."""
+    scale = _SHARPNESS_SIDE_PIXELS / max(grey.shape)
     if scale < 1:
         grey = np.asarray(
             cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8
@@ -89,7 +86,7 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     chosen = []
     for k, top in enumerate(best):
         around = []
-        for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1)):
+        for j in range(max(0, k - _WINDOWS_AROUND), min(windows, k + _WINDOWS_AROUND + 1)):
             if j != k:
                 around.append(scores[best[j]])
         usual = float(np.median(around)) if around else 0.0
@@ -104,52 +101,25 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
 
 def save_frames(
     video: Path, frames: Sequence[int], place: SceneFolder, state: State, progress: Progress
-) -> None:
-    """Write some of the frames, at least one, as JPEG (95)."""
+) -> list[str]:
+    """Write some of the frames, at least one, as JPEG (95). Returns what was decided about the video."""
     wanted = set(frames)
     last = max(frames)
     done = 0
-    for index, (_, image) in enumerate(_frames(video, wanted)):
+    log, found = read_video(video)
+    for index, frame in enumerate(found):
         if index in wanted:
-            coded, data = cv2.imencode(
-                ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-            )
+            bgr = cv2.cvtColor(frame.picture(), cv2.COLOR_RGB2BGR)
+            coded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _FRAME_QUALITY])
             assert coded
-            _write_image(place, state, _FRAME.format(index), data.tobytes())
+            _write_image(place, state, _FRAME_NAME.format(index), data.tobytes())
             done += 1
             progress(done, len(wanted), "writing frames")
         if index == last:
-            return
+            return log.notes
     raise DataError(
         f"{video}: frame {last} was there before and is not now; keep the video as it is while it is processed"
     )
-
-
-def _frames(video: Path, wanted: set[int] | None = None) -> Iterator[tuple[int, Image]]:
-    """The number of frames that a video claims to have, with each of them; those that are not wanted come
-    empty.
-
-    Raises DataError where it cannot be opened.
-    """
-    reader = cv2.VideoCapture(str(video))
-    try:
-        if not reader.isOpened():
-            raise DataError(
-                f"{video}: no video that can be opened; convert it to H.264 in an .mp4, or give a folder of images"
-            )
-        expected = max(0, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
-        index = 0
-        while reader.grab():
-            image = np.empty((0, 0, 3), dtype=np.uint8)
-            if wanted is None or index in wanted:
-                done, frame = reader.retrieve()
-                if not done:
-                    return
-                image = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            yield expected, image
-            index += 1
-    finally:
-        reader.release()
 
 
 class Lens(NamedTuple):
@@ -177,6 +147,23 @@ def read_lens(path: Path) -> Lens:
     return Lens(
         model, focal if 0 < focal < math.inf else 0.0, int(focal_35) if 0 < focal_35 < math.inf else 0
     )
+
+
+def read_encoder(path: Path) -> str:
+    """A hash of how a JPEG was encoded: quantisation tables, sampling of colours, progressive or not. Empty for
+    other images.
+
+    Phones and messengers have their own; photographs of one phone share them, or nearly.
+    """
+    try:
+        with path.open("rb") as file:
+            image = open_image(file, path)[1]
+            tables = sorted(getattr(image, "quantization", {}).items())
+            sampling = [layer[1:3] for layer in getattr(image, "layer", [])]
+            progressive = bool(image.info.get("progressive"))
+    except Exception:  # whatever is wrong with it, it is not needed
+        return ""
+    return step_key(tables, sampling, progressive) if tables else ""
 
 
 def _exif(path: Path) -> PIL.Image.Exif:
@@ -208,15 +195,16 @@ def gather_images(
             f"{source}: is the scene folder itself; give {place.images}, or name another --output"
         )
     if source.is_dir():
+        state.notes.pop("frames", None)
         gathered = _from_folder(source, place, state, progress)
     elif source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
         gathered = _from_video(source, place, state, config, progress)
     else:
         kinds = " ".join(sorted(VIDEO_SUFFIXES))
         raise UsageError(f"{source}: neither a folder of images nor a video ({kinds}); check the path")
-    if len(gathered) < _FEWEST:
+    if len(gathered) < _MIN_IMAGES:
         state.images = gathered
-        why = lost_files(state) or "the video holds no more"
+        why = lost_files(state) or "; ".join(state.notes.get("frames", [])) or "the video holds no more"
         if source.is_dir() and not state.dropped:
             endings = sorted(
                 {path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix}
@@ -227,7 +215,7 @@ def gather_images(
                 there = "it holds no files"
             left_out = "".join(f"{note}; " for note in state.notes.get("left out", []))
             why = f"{left_out}{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
-        raise DataError(f"{source}: {why}; {len(gathered)} usable images, at least {_FEWEST} are needed")
+        raise DataError(f"{source}: {why}; {len(gathered)} usable images, at least {_MIN_IMAGES} are needed")
     # Images that are no longer used go, but never from the source itself.
     for name in set(state.images) - set(gathered):
         if place.images.resolve() != source.resolve():
@@ -254,11 +242,11 @@ def lost_files(state: State) -> str:
 
 def _some(words: list[str]) -> str:
     """The first ones of a list, and how many there are beside."""
-    if len(words) > _NAMED:
-        beside = [f"{len(words) - _NAMED} more"]
+    if len(words) > _MAX_NAMED_FILES:
+        beside = [f"{len(words) - _MAX_NAMED_FILES} more"]
     else:
         beside = []
-    return ", ".join(words[:_NAMED] + beside)
+    return ", ".join(words[:_MAX_NAMED_FILES] + beside)
 
 
 def natural_order(names: Iterable[str]) -> list[str]:
@@ -319,7 +307,7 @@ def _from_folder(
             if shown != given:
                 raise DataError("its name is not UTF-8: rename it")
             kind = read_header(path).kind
-            foreign = kind in _FOREIGN
+            foreign = kind in _UNREAD_BY_COLMAP
             name = f"{name}.jpg" if foreign else name
             known = state.images.get(name, {})
             fresh = known.get("sha256") != digest or not (place.images / name).is_file()
@@ -364,21 +352,23 @@ def _from_video(
         return state.images
     # How sharp every frame is, before any is chosen: blur is told by the frames around.
     scores: list[float] = []
-    for expected, frame in _frames(source):
-        progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
-        scores.append(sharpness(frame))
+    log, found = read_video(source)
+    for frame in found:
+        progress(len(scores), max(log.expected, len(scores) + 1), "looking for sharp frames")
+        scores.append(sharpness(frame.grey()))
     if not scores:
         raise DataError(
             f"{source}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images"
         )
     progress(len(scores), len(scores), "looking for sharp frames")
     chosen, dropped = choose_frames(scores, config.frames, config.blurred)
-    save_frames(source, chosen, place, state, progress)
+    decided = save_frames(source, chosen, place, state, progress)
+    state.notes["frames"] = [log.sentence(), *dict.fromkeys([*log.notes, *decided])]
     state.dropped = {f"frame {frame}": reason for frame, reason in dropped.items()}
     state.done["frames"] = key
     frames = {}
     for number in chosen:
-        path = place.images / _FRAME.format(number)
+        path = place.images / _FRAME_NAME.format(number)
         frames[path.name] = _described(path, hashlib.sha256(path.read_bytes()).hexdigest())
     return frames
 
@@ -410,7 +400,7 @@ def _jpeg(path: Path) -> bytes:
         block = exif.tobytes()
     except Exception:  # values that Pillow read and cannot write
         block = b""
-    block = block if len(block) < _EXIF_BYTES else b""
+    block = block if len(block) < _MAX_EXIF_BYTES else b""
     PIL.Image.fromarray(pixels).save(data, "JPEG", quality=97, subsampling=0, exif=block)
     return data.getvalue()
 
@@ -425,4 +415,5 @@ def _described(path: Path, digest: str) -> dict[str, Any]:
         "width": width,
         "height": height,
         "lens": list(read_lens(path)),
+        "encoder": read_encoder(path),
     }

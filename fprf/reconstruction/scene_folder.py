@@ -1,6 +1,7 @@
 """A scene folder in the making: where its parts lie, what was done already, and what came of every image.
 
 images/            the images that are used
+masks/             their masks, if some were given
 sparse/0/          COLMAP's model, once there is one
 process.json       what came of every image
 sfm/               database.db, state.json, log.txt and the jobs: only needed to go on
@@ -8,20 +9,24 @@ sfm/               database.db, state.json, log.txt and the jobs: only needed to
 
 import contextlib
 import hashlib
+import itertools
 import json
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
+from ..io.folder_lock import LOCK
 
-_FORMAT = 1
-_IGNORED = {"images", "sfm", ".DS_Store", "Thumbs.db", "desktop.ini"}
-"""Names that a folder may hold when a scene is begun in it: images, and what file managers leave behind."""
+_STATE_FORMAT = 1
+"""Version of state.json."""
+_NAMES_OF_NEW_FOLDERS = {"images", "masks", "sfm", LOCK, ".DS_Store", "Thumbs.db", "desktop.ini"}
+"""Names that a folder may hold when a scene is begun in it: images, masks, our lock, and what file managers leave behind.
+"""
 
 Progress = Callable[[int, int, str], None]
 """Told (done, total, what)."""
@@ -33,6 +38,8 @@ class SceneFolder:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.images = root / "images"
+        self.masks = root / "masks"
+        """Masks of the images, as COLMAP and `fprf train` look for them."""
         self.work = root / "sfm"
         """Folder of what is needed to go on."""
         self.database = self.work / "database.db"
@@ -59,6 +66,8 @@ class State:
     """Key of each finished step by its name."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time of each finished step."""
+    masks: dict[str, str] = field(default_factory=dict)
+    """Hashes of the masks by image; empty without."""
     notes: dict[str, list[str]] = field(default_factory=dict)
     """What was decided, by the step that decided it."""
 
@@ -74,14 +83,14 @@ class State:
                 here = [entry.name for entry in place.root.iterdir()]
             else:
                 here = []
-            if (place.root.exists() and not place.root.is_dir()) or set(here) - _IGNORED:
+            if (place.root.exists() and not place.root.is_dir()) or set(here) - _NAMES_OF_NEW_FOLDERS:
                 raise UsageError(
                     f"--output {place.root}: holds something else; name a folder that is new or empty"
                 )
             return cls()
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            if content.pop("format") != _FORMAT:
+            if content.pop("format") != _STATE_FORMAT:
                 raise ValueError("written by another version")
             return cls(**content)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -91,7 +100,7 @@ class State:
 
     def save(self, place: SceneFolder) -> None:
         """Write it."""
-        write_json(place.work / "state.json", {"format": _FORMAT, **vars(self)})
+        write_json(place.work / "state.json", {"format": _STATE_FORMAT, **vars(self)})
 
 
 def step_key(*parts: object) -> str:
@@ -99,10 +108,10 @@ def step_key(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-_MAX_IMAGES = 2147483647
-"""A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
-_LEAST = 15
-"""Verified matches from which on COLMAP takes two images for neighbours."""
+PAIR_FACTOR = 2147483647
+"""A pair of images is stored as PAIR_FACTOR * smaller id + larger id: COLMAP's kMaxNumImages."""
+MIN_MATCHES = 15
+"""Verified matches from which on COLMAP takes two images for neighbours: its min_num_matches."""
 
 
 class MatchTables:
@@ -115,13 +124,17 @@ class MatchTables:
             names = dict(base.execute("SELECT image_id, name FROM images"))
             features = dict(base.execute("SELECT image_id, rows FROM keypoints"))
             pairs = base.execute(
-                "SELECT pair_id FROM two_view_geometries WHERE rows >= ?", (_LEAST,)
+                "SELECT pair_id FROM two_view_geometries WHERE rows >= ?", (MIN_MATCHES,)
             ).fetchall()
         self.features: dict[str, int] = {name: features.get(number, 0) for number, name in names.items()}
         """Features of each image that COLMAP could decode."""
-        fit = [divmod(pair, _MAX_IMAGES) for (pair,) in pairs]
-        self.partners = Counter(names[number] for pair in fit if names.keys() >= {*pair} for number in pair)
+        self.partners: Counter[str] = Counter()
         """Images that share enough verified matches with an image."""
+        for (pair,) in pairs:
+            first, second = divmod(pair, PAIR_FACTOR)
+            if first in names and second in names:
+                self.partners[names[first]] += 1
+                self.partners[names[second]] += 1
 
 
 def count_rows(path: Path) -> tuple[int, int]:
@@ -156,22 +169,42 @@ def report(
     """
     images = state["images"]
     unused = state["dropped"]
-    if models:
-        main = models[0]
-    else:
-        main = {"images": [], "points": 0, "error_pixels": None, "track_length": None}
-    posed = set(main["images"])
-    size = [len(model["images"]) for model in models]
+    main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
+    dropped = []
+    for image, reason in unused.items():
+        dropped.append({"image": image, "step": "choosing", "reason": reason})
+    dropped += _dropped_images(images, matches, models)
+    return {
+        "format": 1,
+        "fprf": version,
+        "source": state["source"],
+        "images": {
+            "given": len(images) + len(unused),
+            "used": len(images),
+            "posed": len(set(main["images"])),
+        },
+        "points": main["points"],
+        "error_pixels": main["error_pixels"],
+        "track_length": main["track_length"],
+        "parts": [len(model["images"]) for model in models],
+        "matching": matching,
+        "notes": list(itertools.chain.from_iterable(state.get("notes", {}).values())),
+        "step_seconds": dict(state["seconds"]),
+        "dropped": dropped,
+    }
+
+
+def _dropped_images(
+    images: Iterable[str], matches: MatchTables, models: Sequence[Mapping[str, Any]]
+) -> list[dict[str, str]]:
+    """Images without a pose in the first model, with the first step that they did not pass, in the order of
+    the steps.
+    """
+    posed = set(models[0]["images"]) if models else set()
     part_of: dict[str, int] = {}  # the largest part that has it
     for number, model in enumerate(models, 1):
         part_of = dict.fromkeys(model["images"], number) | part_of
-    lost: dict[str, list[tuple[str, str]]] = {
-        "choosing": [*unused.items()],
-        "features": [],
-        "matching": [],
-        "mapping": [],
-    }
-    # The first step that an image did not pass is where it was lost.
+    lost: dict[str, list[tuple[str, str]]] = {"features": [], "matching": [], "mapping": []}
     for name in images:
         features = matches.features.get(name)
         partners = matches.partners[name]
@@ -187,24 +220,13 @@ def report(
                 (name, f"{features} features, but it fits no other image; take views in between")
             )
         elif part is not None:
-            apart = f"in part {part} ({size[part - 1]} images), apart from the rest; take views in between"
+            count = len(models[part - 1]["images"])
+            apart = f"in part {part} ({count} images), apart from the rest; take views in between"
             lost["mapping"].append((name, apart))
         else:
             lost["mapping"].append((name, f"fits {partners} images, but no pose was found for it"))
-    return {
-        "format": 1,
-        "fprf": version,
-        "source": state["source"],
-        "images": {"given": len(images) + len(unused), "used": len(images), "posed": len(posed)},
-        "points": main["points"],
-        "error_pixels": main["error_pixels"],
-        "track_length": main["track_length"],
-        "parts": size,
-        "matching": matching,
-        "step_seconds": dict(state["seconds"]),
-        "dropped": [
-            {"image": image, "step": step, "reason": reason}
-            for step, drops in lost.items()
-            for image, reason in drops
-        ],
-    }
+    dropped = []
+    for step, drops in lost.items():
+        for image, reason in drops:
+            dropped.append({"image": image, "step": step, "reason": reason})
+    return dropped

@@ -8,13 +8,28 @@ reconstruction; anything else is COLMAP's failure.
 
 import itertools
 import json
+import shutil
+import statistics
 import sys
 from pathlib import Path
 from typing import Any
 
 NO_PYCOLMAP = 3
+"""Exit code: pycolmap is absent or too old."""
 NO_MODEL = 4
-_FIRST_ANGLES = 16.0, 2.0
+"""Exit code: no two images fit together."""
+_POINTS_OF_IMAGE = 300
+"""Points of an image that lenses are told apart by: a hundred images take seconds, and focal lengths come out
+within 2 %."""
+_MAX_LENS_RATIO = 10.0
+"""Ratio of the longest and the shortest lens of a capture: phones have 13 to 120 mm."""
+_MAX_LENS_ITERATIONS = 50
+"""Rounds of bundle adjustment that lenses are told apart by: two lenses by 30 % take 20. By eye."""
+_LENS_TOLERANCE = 1e-6
+"""Relative fall of the cost below which the adjustment ends; COLMAP's own 0 takes all rounds."""
+_MIN_MODEL_IMAGES = 3
+"""Images of a reconstruction, at least: fewer are no scene."""
+_FIRST_ANGLES = (16.0, 2.0)
 """Degrees between the rays of the first pair, at least; COLMAP itself goes down to a quarter. Where all
 photographs face the same things from nearly one place (llff_flower: 34 within an arm's length) none has more
 than four.
@@ -22,12 +37,12 @@ than four.
 
 
 def main(job: dict[str, Any]) -> int:
-    """Run a job: `step` is features, matches or mapping."""
+    """Run a job: `step` is features, matches, mapping or lenses."""
     try:
         import pycolmap
 
         # Another seed finds other points; the options looked up here are absent before pycolmap 4.
-        steps = {"features": _features, "matches": _matches, "mapping": _mapping}
+        steps = {"features": _features, "matches": _matches, "mapping": _mapping, "lenses": _lenses}
         pycolmap.set_random_seed(job["seed"])
         pycolmap.FeatureExtractionOptions, pycolmap.ImportedPairingOptions  # noqa: B018
     except (ImportError, AttributeError) as error:
@@ -58,6 +73,8 @@ def _features(pycolmap: Any, job: dict[str, Any]) -> int:
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = job["lens"]
         reader.existing_camera_id = camera
+        if job["masks"]:
+            reader.mask_path = job["masks"]
         pycolmap.extract_features(
             job["database"],
             job["images"],
@@ -92,20 +109,25 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job["threads"]
     options.random_seed = job["seed"]
-    options.min_model_size = 3
+    options.min_model_size = _MIN_MODEL_IMAGES
     registered = itertools.count(1)
 
     def count() -> None:
         print(json.dumps({"registered": next(registered)}), flush=True)
 
-    # COLMAP calls back for the first pair and for every image after it.
     out = Path(job["models"])
     out.mkdir(parents=True, exist_ok=True)
+    database = job["database"]
+    if job["lenses"]:
+        database = str(out / "database.db")
+        shutil.copyfile(job["database"], database)
+        _regroup(pycolmap, database, job["lenses"], job["focal"])
+    # COLMAP calls back for the first pair and for every image after it.
     mapped = {}
     for angle in _FIRST_ANGLES:
         options.mapper.init_min_tri_angle = angle
         mapped = pycolmap.incremental_mapping(
-            job["database"],
+            database,
             job["images"],
             str(out),
             options,
@@ -114,7 +136,10 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
         )
         if mapped:
             break
-    models = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    found = list(mapped.values())
+    if job["lenses"]:
+        found = [model for model in found if _has_true_lenses(model)]
+    models = sorted(found, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     described = []
     for model in models:
         described.append(
@@ -130,7 +155,119 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
         best.mkdir(exist_ok=True)
         models[0].write_binary(str(best))
     (out / "models.json").write_text(json.dumps(described), encoding="utf-8")
+    # Lenses are tried beside a model that is there: none is an answer.
+    if job["lenses"]:
+        Path(database).unlink()
+        return 0
     return 0 if models else NO_MODEL
+
+
+def _has_true_lenses(model: Any) -> bool:
+    """True where all focal lengths could be those of lenses on one walk."""
+    focal = [camera.mean_focal_length() for camera in model.cameras.values()]
+    return bool(min(focal) > 0 and max(focal) < _MAX_LENS_RATIO * min(focal))
+
+
+def _regroup(pycolmap: Any, database: str, lenses: dict[str, str], focal: dict[str, float]) -> None:
+    """Give each lens a camera of its own in a database, beginning with the focal length where one is known."""
+    with pycolmap.Database.open(database) as base:
+        frame_of = {}
+        for frame in base.read_all_frames():
+            for data in frame.data_ids:
+                frame_of[data.id] = frame
+        sensors: dict[str, tuple[Any, int]] = {}
+        for image in base.read_all_images():
+            lens = lenses.get(image.name)
+            if lens is None:
+                continue
+            if lens not in sensors:
+                camera = _copied(pycolmap, base.read_camera(image.camera_id), focal.get(lens))
+                sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, base.write_camera(camera))
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(sensor)
+                sensors[lens] = (sensor, base.write_rig(rig))
+            # The frame goes first: an image is checked against it.
+            sensor, rig_number = sensors[lens]
+            frame = pycolmap.Frame()
+            frame.frame_id = frame_of[image.image_id].frame_id
+            frame.rig_id = rig_number
+            frame.add_data_id(pycolmap.data_t(sensor, image.image_id))
+            base.update_frame(frame)
+            image.camera_id = sensor.id
+            base.update_image(image)
+
+
+def _copied(pycolmap: Any, camera: Any, focal: float | None) -> Any:
+    """A camera like another, without a number, with another focal length where one is given."""
+    params = list(camera.params)
+    if focal is not None:
+        for index in camera.focal_length_idxs():
+            params[index] = focal
+    return pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=params)
+
+
+def _lenses(pycolmap: Any, job: dict[str, Any]) -> int:
+    """Adjust a model with each of some groupings of its images by lens: error and focal lengths of each."""
+    model = pycolmap.Reconstruction(job["model"])
+    points = _sampled_points(model)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.max_num_iterations = _MAX_LENS_ITERATIONS
+    options.ceres.solver_options.function_tolerance = _LENS_TOLERANCE
+    options.ceres.solver_options.num_threads = job["threads"]
+    results = []
+    for lenses in job["groupings"]:
+        grouped = _with_lenses(pycolmap, model, points, lenses)
+        pycolmap.bundle_adjustment(grouped, options)
+        grouped.update_point_3d_errors()
+        focal = {}
+        for image in grouped.images.values():
+            focal[image.name] = grouped.cameras[image.camera_id].mean_focal_length()
+        results.append({"error": grouped.compute_mean_reprojection_error(), "focal": focal})
+        print(json.dumps({"solved": len(results)}), flush=True)
+    Path(job["result"]).write_text(json.dumps(results), encoding="utf-8")
+    return 0
+
+
+def _sampled_points(model: Any) -> list[int]:
+    """Numbers of points that many images see, so many that each image sees enough of them."""
+    seen = dict.fromkeys(model.images, 0)
+    chosen = []
+    for number, point in sorted(model.points3D.items(), key=lambda item: -item[1].track.length()):
+        images = {element.image_id for element in point.track.elements}
+        if any(seen[image] < _POINTS_OF_IMAGE for image in images):
+            chosen.append(number)
+            for image in images:
+                seen[image] += 1
+    return chosen
+
+
+def _with_lenses(pycolmap: Any, model: Any, points: list[int], lenses: dict[str, str]) -> Any:
+    """A copy of a model with some of its points, and a camera for each lens, of the median focal length."""
+    posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    focal: dict[str, list[float]] = {}
+    for image in posed:
+        focal.setdefault(lenses[image.name], []).append(model.cameras[image.camera_id].mean_focal_length())
+    grouped = pycolmap.Reconstruction()
+    cameras: dict[str, int] = {}
+    for image in posed:
+        lens = lenses[image.name]
+        if lens not in cameras:
+            middle = statistics.median(focal[lens])
+            camera = _copied(pycolmap, model.cameras[image.camera_id], middle)
+            camera.camera_id = len(cameras) + 1
+            grouped.add_camera_with_trivial_rig(camera)
+            cameras[lens] = camera.camera_id
+        places = pycolmap.Point2DList([pycolmap.Point2D(place.xy) for place in image.points2D])
+        copy = pycolmap.Image(
+            name=image.name, camera_id=cameras[lens], image_id=image.image_id, points2D=places
+        )
+        grouped.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for number in points:
+        point = model.points3D[number]
+        grouped.add_point3D(point.xyz, point.track, point.color)
+    return grouped
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.doctor import Finding, machine, method_needs, run, scene_folder, self_test
+from fprf.cli.doctor import Finding, machine, method_needs, run, scene_folder, self_test, video_file
+from fprf.errors import DataError
 from fprf.ops import dense
 from fprf.style.look import Restyle
 from fprf.training import device_check, views
@@ -253,3 +254,27 @@ def test_what_a_scene_leaves_out_scales_and_lacks_is_named(tmp_path: Path) -> No
     assert any("copy of it.png" in finding.found for finding in found if finding.what == "note")
     (masks,) = (finding for finding in found if finding.what == "masks")
     assert "who.png" in masks.found and masks.remedy and not masks.optional
+
+
+def test_a_video_says_what_can_be_read_of_it(tmp_path: Path) -> None:
+    from fprf.io.video import write_video
+
+    frames = [np.random.default_rng(k).integers(0, 255, (48, 64, 3), dtype=np.uint8) for k in range(9)]
+    write_video(tmp_path / "clip.mp4", frames, 9, h264=False)
+    found = _by_name(video_file(tmp_path / "clip.mp4"))
+    assert found["format"].found == "video of 64 x 48 pixels"
+    assert "9 frames" in found["frames"].found and not found["frames"].remedy
+    assert found["next"].found == f"fprf process {tmp_path / 'clip.mp4'}"
+    assert run([str(tmp_path / "clip.mp4")]) == 0
+    (tmp_path / "half.mp4").write_bytes((tmp_path / "clip.mp4").read_bytes()[:2000])
+    with pytest.raises(DataError, match="moov"):
+        run([str(tmp_path / "half.mp4")])
+
+
+def test_photographs_that_say_no_focal_length_are_told(tmp_path: Path) -> None:
+    for name in ("anna", "ben"):
+        for k in range(4):
+            pixels = np.random.default_rng(len(name) + 9 * k).integers(0, 255, (16, 24, 3), dtype=np.uint8)
+            Image.fromarray(pixels).save(tmp_path / f"{name}_{k}.jpg")
+    found = _by_name(scene_folder(tmp_path))["lenses"].found
+    assert found.startswith("8 of 8 photographs") and "names" in found

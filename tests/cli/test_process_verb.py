@@ -18,7 +18,10 @@ import pytest
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import DEFAULT_METHOD
+from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.parsers.config import parse_scene
+from fprf.io.folder_lock import LOCK, lock_folder
+from fprf.io.video import write_video
 from fprf.training.driver import default_output
 
 FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"
@@ -210,3 +213,46 @@ def test_the_worker_never_meets_opencv(photos: Path) -> None:
         if "import pycolmap" in path.read_text("utf-8")
     ]
     assert [path.name for path in sources] == ["worker.py"]
+
+
+def test_a_second_process_in_one_folder_is_refused_and_leaves_it_as_it_was(
+    photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = photos.parent / "scene"
+    with lock_folder(scene, "is finding poses here"):
+        before = sorted(path.name for path in scene.rglob("*"))
+        assert cli.main(["process", str(photos), "--output", str(scene)]) == 2
+        error = capsys.readouterr().err.splitlines()
+        assert len(error) == 1 and f"process {os.getpid()}" in error[0]
+        assert sorted(path.name for path in scene.rglob("*")) == before
+    assert process(photos) == 0 and report(photos)["images"]["posed"] == 5
+    assert not (scene / LOCK).exists()
+
+
+def test_masks_reach_colmap_and_the_scene(photos: Path) -> None:
+    (photos.parent / "masks").mkdir()
+    for k in range(5):
+        pixels = np.zeros((16, 24), np.uint8)
+        pixels[:, : 10 + k] = 255
+        assert cv2.imwrite(str(photos.parent / "masks" / f"{k}.png"), pixels)
+    assert process(photos, "--masks", str(photos.parent / "masks")) == 0
+    scene = parse_scene(photos.parent / "scene", 1, None)
+    assert [load_mask(path).sum() for path in scene.masks if path] == [16 * (10 + k) for k in range(5)]
+    job = json.loads((photos.parent / "scene" / "sfm" / "features.job.json").read_text())
+    assert Path(job["masks"]) == photos.parent / "scene" / "masks"
+    calls(photos)
+    assert process(photos) == 0
+    assert calls(photos)[0].startswith("features"), "without masks features are others"
+    assert not any(parse_scene(photos.parent / "scene", 1, None).masks)
+
+
+def test_what_was_read_of_a_video_is_said_and_written_down(
+    photos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clip = photos.parent / "clip.mp4"
+    write_video(clip, [cv2.imread(str(photos / f"{k % 5}.png")) for k in range(9)], 9, h264=False)
+    assert process(clip, "--blurred", "0") == 0
+    told = report(clip)["notes"]
+    assert told[0] == "clip.mp4: all of its 9 frames were read"
+    assert told[0] in capsys.readouterr().err
+    assert process(clip, "--blurred", "0") == 0 and report(clip)["notes"] == told

@@ -16,7 +16,7 @@ from benchmarks.town.write import write_town
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
-from fprf.reconstruction.colmap import (
+from fprf.reconstruction.pairs import (
     build_vocabulary,
     descriptors,
     sequential_pairs,
