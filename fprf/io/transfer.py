@@ -94,9 +94,9 @@ _CINEMA_WHITE = 48 / 52.37
 """Light of white in SMPTE ST 428-1, of the signal 1."""
 _BRADFORD = ((0.8951, 0.2664, -0.1614), (-0.7502, 1.7135, 0.0367), (0.0389, -0.0685, 1.0296))
 """XYZ to the cone responses in which whites are adapted (ICC.1:2022, annex E)."""
-_LEVELS = 1 << 16
+_SRGB_LEVELS = 1 << 16
 """Steps of light in [0, 1] that are told apart on the way to 8 bits: at most a twentieth of a level."""
-_ROWS = 256
+_ROWS_AT_ONCE = 256
 """Rows converted at a time: bounds the memory."""
 
 
@@ -217,12 +217,12 @@ def picture_of(
     signal_table = _signal_table()
     matrix = _matrix(space.primaries).T.astype(np.float32)
     picture = np.empty(levels.shape, dtype=np.uint8)
-    for top in range(0, len(levels), _ROWS):
-        light = light_table[levels[top : top + _ROWS]]
+    for top in range(0, len(levels), _ROWS_AT_ONCE):
+        light = light_table[levels[top : top + _ROWS_AT_ONCE]]
         if space.high_dynamic_range and light.max() > KNEE_LIGHT:
             light = tone_mapped(light)
-        steps = ((light @ matrix).clip(0, 1) * np.float32(_LEVELS - 1) + np.float32(0.5)).astype(np.uint16)
-        picture[top : top + _ROWS] = signal_table[steps]
+        steps = ((light @ matrix).clip(0, 1) * np.float32(_SRGB_LEVELS - 1) + np.float32(0.5)).astype(np.uint16)
+        picture[top : top + _ROWS_AT_ONCE] = signal_table[steps]
     return picture
 
 
@@ -240,7 +240,7 @@ def _light_table(space: ColourSpace, largest: int, full_range: bool) -> NDArray[
 @lru_cache(maxsize=1)
 def _signal_table() -> NDArray[np.uint8]:
     """The sRGB signal, in 8 bits, of each step of light."""
-    signal = srgb_signal(np.arange(_LEVELS) / (_LEVELS - 1))
+    signal = srgb_signal(np.arange(_SRGB_LEVELS) / (_SRGB_LEVELS - 1))
     return np.asarray(np.rint(signal * 255), dtype=np.uint8)
 
 

@@ -2,6 +2,9 @@
 
 import json
 import shutil
+import struct
+import sys
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ import torch
 from fake_packages import Packages
 from PIL import Image
 from pretend_cuda import CUDA, pretend_cuda
+from raw_files import dng
 from tiny_world import World
 
 from fprf.cli import main as cli
@@ -222,6 +226,32 @@ def test_damaged_images_are_named(tmp_path: Path) -> None:
         "06.png" in _by_name(scene_folder(folder))["images"].found
         and not _by_name(scene_folder(folder))["images"].optional
     )
+
+
+def test_transparent_hdr_and_raw_photographs_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_scene(tmp_path / "s")
+    pictures = folder / "images"
+    clear = np.dstack(
+        [np.asarray(Image.open(pictures / "03.png").convert("RGB")), np.zeros((96, 96), np.uint8)]
+    )
+    Image.fromarray(clear).save(pictures / "03.png")
+    data = (pictures / "05.png").read_bytes()
+    tag = b"cICP" + bytes((9, 16, 0, 1))
+    chunk = struct.pack(">I", 4) + tag + struct.pack(">I", zlib.crc32(tag))
+    (pictures / "05.png").write_bytes(data[:33] + chunk + data[33:])
+    found = _by_name(scene_folder(folder))
+    assert "03.png: 0.00% of its pixels are opaque" in found["images"].found and found["images"].remedy
+    assert "05.png" in found["colours"].found and "PQ" in found["colours"].found
+    flat = np.full((96, 96, 3), 0.5)
+    (pictures / "05.png").write_bytes(dng(flat, np.zeros((8, 8, 3), np.uint8)))
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "rawpy", None)
+        with pytest.raises(DataError, match=r"05\.png: is a raw photograph \(DNG\).*fprf\[raw\]"):
+            list(scene_folder(folder))
+    pytest.importorskip("rawpy")
+    assert "raw (DNG)" in _by_name(scene_folder(folder))["colours"].found
 
 
 def save_picture(path: Path, grey: int) -> None:
