@@ -21,7 +21,8 @@ from fprf.splats.gaussians import Gaussians
 
 pytestmark = pytest.mark.slow
 
-PACKAGES = ("@playcanvas/splat-transform@2.7.1", "three@0.187.0")
+SPLAT_TRANSFORM = "3.7.0"
+PACKAGES = (f"@playcanvas/splat-transform@{SPLAT_TRANSFORM}", "three@0.187.0")
 LOADER = """
 import fs from 'fs';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
@@ -47,7 +48,7 @@ def node() -> Path:
     """The folder with the packages."""
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("Node and npm are not installed: nothing to hold the files against")
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fprf-tests" / "node"
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fprf-tests" / f"node-{SPLAT_TRANSFORM}"
     cache.mkdir(parents=True, exist_ok=True)
     if not (cache / "node_modules" / "three").is_dir():
         words = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(cache), *PACKAGES]
