@@ -19,7 +19,7 @@ from fprf.interfaces import Parts
 from fprf.io.images import write_image
 from fprf.ops import backend
 from fprf.rendering.cameras import Cameras, PixelRays
-from fprf.rendering.renderer import march, render_rays
+from fprf.rendering.renderer import TrainingStep, march, render_rays
 from fprf.style.look import Restyle
 from fprf.training.facts import Facts
 from fprf.training.field_learner import FieldLearner
@@ -175,7 +175,7 @@ def colour_gradient(
         want=Want.COLOUR,
         budget=config.render.train_budget,
         background=background_of(prepared.facts, rays.near.device),
-        step=step,
+        training=TrainingStep(step=step),
     )
     assert out.rgb is not None
     loss = (out.rgb - batch.rgb.to(out.rgb)).square().mean()

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-_PROBE = bytes(4096)
+_BLOCK_OF_ZEROS = bytes(4096)
 """A block of a disk: where it is full a file can still be made, but not filled."""
 _NOWHERE = Path(os.devnull, "fprf")
 """A folder that cannot be: what is to be written to it stays in memory."""
@@ -57,7 +57,7 @@ def refusal(folder: Path) -> str:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(_PROBE)
+            file.write(_BLOCK_OF_ZEROS)
     except OSError as error:
         return reason_of(error)
     return ""

@@ -23,7 +23,7 @@ from .simd import BLOCK, WIDE, load, maximum, narrow, repeat, store, traced
 from .threads import cached_jit
 
 _jit = cached_jit(parallel=True, nogil=True)
-_LEAST = np.float32(-np.inf)
+_NO_FLOOR = np.float32(-np.inf)
 # As many sums as registers hold beside the weights: 24 of 32 on machines with 512 bits, 12 of 16 elsewhere.
 ROWS = (0, 16, 12, 8, 6) if WIDE == 16 else (0, 12, 6, 4, 3)
 """Rows of the tile with so many columns of vectors."""
@@ -32,7 +32,9 @@ ROWS = (0, 16, 12, 8, 6) if WIDE == 16 else (0, 12, 6, 4, 3)
 @traced
 def multiply(x, x_at, w, w_at, w_step, start, s_at, s_row, out, o_at, depth, floor, columns):
     """A tile of outputs from the floor on. A NaN is not below it and stays."""
-    places = [(r, c) for r in range(ROWS[columns]) for c in range(columns)]
+    places = []
+    for r in range(ROWS[columns]):
+        places += [(r, c) for c in range(columns)]
 
     def step(k, sums):
         weights = [load(w, w_at + k * w_step + c * WIDE, WIDE) for c in range(columns)]
@@ -91,7 +93,7 @@ def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, 
     layers = len(widths)
     for layer in range(layers):
         width = widths[layer]
-        floor = np.float32(0) if layer < layers - 1 else _LEAST
+        floor = np.float32(0) if layer < layers - 1 else _NO_FLOOR
         # Sums that start from `here` may end there: a tile is read whole before it is written.
         goal = here if layer % 2 == 0 else there
         product(source, at, weights, w_at, width, start, b_at, s_row, goal, depth, floor)

@@ -28,10 +28,12 @@ from torch import Tensor
 from ..errors import DataError
 from .backend import float64_device
 
-# Measured on photographs: 8 to 12 cost a tenth of the error that the stride brings anyway, 6 doubles it.
 FINENESS = 10.0
-# Largest intermediate, in elements (64 MiB of float32): channels are worked on in groups that fit.
+"""Nodes in a window's width. Measured on photographs: 8 to 12 cost a tenth of the error that the stride brings
+anyway, 6 doubles it.
+"""
 GROUP = 1 << 24
+"""Largest intermediate, in elements (64 MiB of float32): channels are worked on in groups that fit; by eye."""
 
 
 class _Axis(NamedTuple):
@@ -71,7 +73,8 @@ def coefficients(
 
     # Statistics of the guide, float64 and about its mean.
     wide = float64_device(features.device)
-    y, x = (_Axis(*(operator.to(wide) for operator in axis)) for axis in (y, x))
+    y = _Axis(*(operator.to(wide) for operator in y))
+    x = _Axis(*(operator.to(wide) for operator in x))
     pixels = guide.detach().to(device=wide, dtype=torch.float64).permute(2, 0, 1)
     colour = pixels.mean((1, 2), keepdim=True)
     pixels = pixels - colour

@@ -15,8 +15,8 @@ from torch import Tensor
 
 HARMONIC = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
-_TINY = 1e-5
-"""Colours below this may be rounded to less than 0."""
+_MIN_COLOUR = 1e-5
+"""Colours below this may be rounded to less than 0; 0.003 of a step of 8 bits."""
 MAX_COLOUR = 1.5
 """Mean colours are mapped no higher; with 1 pictures lose contrast (docs/gaussians.md)."""
 
@@ -77,7 +77,7 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> A
         # Sums of slices: vectorised over rows, as reductions of a few numbers are not.
         norm = functools.reduce(torch.add, square[:, degree**2 : (degree + 1) ** 2].unbind(1)).sqrt()
         low -= math.sqrt((2 * degree + 1) / (4 * math.pi)) * norm
-    some = (low.amin(1) < _TINY).nonzero()[:, 0]
+    some = (low.amin(1) < _MIN_COLOUR).nonzero()[:, 0]
     colour = 0.5 + torch.einsum("bd,nbc->ndc", directions.values, harmonics[some, :count])
     dark = colour.amin((1, 2)) < 0
     out = harmonics.clone()

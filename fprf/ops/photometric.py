@@ -17,12 +17,19 @@ from .threads import cached_jit, on_threads, take
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
-_weights = np.exp(-((np.arange(11.0) - 5) ** 2) / (2 * 1.5**2))
+"""Pixels of a window's side (Wang et al. 2004)."""
+WINDOW_SIGMA = 1.5
+"""Standard deviation of its weights in pixels (Wang et al. 2004)."""
+SSIM_C1 = 0.01**2
+"""Wang's C1 = (K1 L)^2, for colours with the range L = 1."""
+SSIM_C2 = 0.03**2
+"""Wang's C2 = (K2 L)^2."""
+_weights = np.exp(-((np.arange(float(WINDOW)) - WINDOW // 2) ** 2) / (2 * WINDOW_SIGMA**2))
 _WEIGHTS = (_weights / _weights.sum()).tolist()
-_C1 = 0.01**2
-_C2 = 0.03**2
-_STRIP = 48
-"""Rows that a thread takes at a time."""
+_STRIP_ROWS = 48
+"""Rows that a thread takes at a time; windows that begin above them are computed once more, a fifth. By
+eye.
+"""
 _jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
 
 
@@ -108,10 +115,10 @@ def _similarity(line, x, room, blurred, at, beyond, across, scale, moves, d, lay
     ab = _across(line, 2 * room + x)
     mb = load(blurred, at)
     bb = load(blurred, beyond + at)
-    n1 = 2 * ma * mb + _C1
-    n2 = 2 * (ab - ma * mb) + _C2
-    i1 = 1 / (ma * ma + mb * mb + _C1)
-    i2 = 1 / (aa - ma * ma + bb - mb * mb + _C2)
+    n1 = 2 * ma * mb + SSIM_C1
+    n2 = 2 * (ab - ma * mb) + SSIM_C2
+    i1 = 1 / (ma * ma + mb * mb + SSIM_C1)
+    i2 = 1 / (aa - ma * ma + bb - mb * mb + SSIM_C2)
     both = i1 * i2
     s = n1 * n2 * both
     inside = where_greater(as_float(across) - as_float(x), lanes(s), splat(s, 1), 0)
@@ -160,14 +167,14 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
     memory = rooms[take(counters, 1)]
     line = memory[: 3 * room]
     moves = memory[3 * room :]
-    layer = (_STRIP + WINDOW - 1) * room
-    strips = (height + _STRIP - 1) // _STRIP
+    layer = (_STRIP_ROWS + WINDOW - 1) * room
+    strips = (height + _STRIP_ROWS - 1) // _STRIP_ROWS
     while True:
         unit = take(counters, 0)
         if unit >= 3 * strips:
             break
-        first = unit % strips * _STRIP
-        last = min(height, first + _STRIP)
+        first = unit % strips * _STRIP_ROWS
+        last = min(height, first + _STRIP_ROWS)
         alike = 0.0
         apart = 0.0
         if similar:
@@ -209,7 +216,8 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
                     _gradient(image, target, at + x, line, x, room, grad)
             for x in range(0, width, LANES):
                 apart += total(_difference(image, target, at + x, width, x, slope, grad))
-        sums[unit, 0], sums[unit, 1] = apart, alike
+        sums[unit, 0] = apart
+        sums[unit, 1] = alike
 
 
 def loss(
@@ -222,8 +230,8 @@ def loss(
     """
     padded = (width + LANES - 1) // LANES * LANES
     grad = np.zeros(3 * padded * ((height + LANES - 1) // LANES * LANES) + 64, np.float32)
-    rooms = np.zeros((numba.get_num_threads(), 3 * (padded + 64) * (_STRIP + WINDOW)), np.float32)
-    sums = np.zeros((3 * -(-height // _STRIP), 2))
+    rooms = np.zeros((numba.get_num_threads(), 3 * (padded + 64) * (_STRIP_ROWS + WINDOW)), np.float32)
+    sums = np.zeros((3 * -(-height // _STRIP_ROWS), 2))
     on_threads(
         _loss, image, target, target_blurred.reshape(-1), width, height, np.float32(share), rooms, grad, sums
     )

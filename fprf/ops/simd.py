@@ -39,10 +39,10 @@ BLOCK = 48
 cache.
 """
 
-_LINE = 64
+_CACHE_LINE_BYTES = 64  # of x86 and most ARM processors
 _FLOAT = ir.FloatType()
-_INT = ir.IntType(32)
-_LONG = ir.IntType(64)
+_INT = ir.IntType(32)  # as wide as a float: bits of one
+_LONG = ir.IntType(64)  # numba's integers
 _FUSE = ("contract", "arcp", "nsz")
 _ADD_ANYHOW = ("contract", "arcp", "nsz", "reassoc")
 
@@ -166,9 +166,8 @@ def _wrapped(context, build, kind, value):
     if isinstance(kind, types.IntegerLiteral):
         return kind.literal_value
     if isinstance(kind, types.UniTuple):
-        return tuple(
-            _wrapped(context, build, kind.dtype, build.extract_value(value, k)) for k in range(kind.count)
-        )
+        parts = [build.extract_value(value, k) for k in range(kind.count)]
+        return tuple(_wrapped(context, build, kind.dtype, part) for part in parts)
     if isinstance(kind, types.Array):
         return _Array(
             build, value if context is None else context.make_array(kind)(context, build, value).data
@@ -256,8 +255,8 @@ def _call(name, *args, flags=_FUSE):
 
 def aligned(count: int) -> np.ndarray[Any, np.dtype[np.float32]]:
     """Room for `count` float32 that begins with a line of the cache."""
-    room = np.empty(count + _LINE // 4, np.float32)
-    first = -room.ctypes.data % _LINE // 4
+    room = np.empty(count + _CACHE_LINE_BYTES // 4, np.float32)
+    first = -room.ctypes.data % _CACHE_LINE_BYTES // 4
     return room[first : first + count]
 
 
@@ -269,7 +268,7 @@ def stack(typing, count):
 
     def generate(context, build, sig, args):
         place = cgutils.alloca_once(build, _FLOAT, ir.Constant(_LONG, sig.args[0].literal_value))
-        place.align = _LINE  # else every vector lies in two lines of the cache
+        place.align = _CACHE_LINE_BYTES  # else every vector lies in two lines of the cache
         return place
 
     return types.CPointer(types.float32)(count), generate
@@ -322,7 +321,8 @@ def repeat(count, start, step, by=1):
     build.cbranch(build.icmp_signed("<", following, count), loop, after)
     build.position_at_end(after)
     results = [build.phi(each.value.type) for each in start]
-    firsts, lasts = ([each.value for each in vectors] for vectors in (start, found))
+    firsts = [each.value for each in start]
+    lasts = [each.value for each in found]
     for phi, first, last in zip(
         [k, *held, *results], [_long(0), *firsts * 2], [following, *lasts * 2], strict=True
     ):
@@ -429,13 +429,14 @@ def swapped(blocks):
     """Four vectors of four quarters: the first quarters of all in one vector, and so on."""
     swapped_lanes = []
     quarter = LANES // 4
+    # The first half of the lanes of one vector, the second half of those of another.
+    halves = [*range(LANES // 2), *range(LANES + LANES // 2, 2 * LANES)]
     for k in range(4):
-        pair = [k * quarter + lane + side * LANES for side in (0, 1) for lane in range(quarter)] * 2
+        ours = [k * quarter + lane for lane in range(quarter)]
+        pair = [*ours, *(lane + LANES for lane in ours)] * 2
         low = _picked(*blocks[:2], pair)
         high = _picked(*blocks[2:], pair)
-        swapped_lanes.append(
-            _picked(low, high, [lane if lane < LANES // 2 else lane + LANES for lane in range(LANES)])
-        )
+        swapped_lanes.append(_picked(low, high, halves))
     return swapped_lanes
 
 
@@ -455,13 +456,25 @@ def sums(values):
 
     def halve(low, high):
         """Add picked lanes of each pair of vectors: half as many vectors."""
-        pairs = [
-            (vectors[k], vectors[k + 1] if k + 1 < len(vectors) else None) for k in range(0, len(vectors), 2)
-        ]
-        return [_picked(x, y, low) + _picked(x, y, high) for x, y in pairs]
+        halved = []
+        for k in range(0, len(vectors), 2):
+            x = vectors[k]
+            y = vectors[k + 1] if k + 1 < len(vectors) else None
+            halved.append(_picked(x, y, low) + _picked(x, y, high))
+        return halved
 
     def within_fours(*offsets):
-        return [4 * g + o for g in range(fours) for o in offsets]
+        picked = []
+        for g in range(fours):
+            picked += [4 * g + offset for offset in offsets]
+        return picked
+
+    def every_second_four(first):
+        picked = []
+        for side in (0, 1):
+            for g in range(first, fours, 2):
+                picked += [side * LANES + 4 * g + j for j in range(4)]
+        return picked
 
     vectors = halve(within_fours(0, LANES, 1, LANES + 1), within_fours(2, LANES + 2, 3, LANES + 3))
     vectors = halve(within_fours(0, 1, LANES, LANES + 1), within_fours(2, 3, LANES + 2, LANES + 3))
@@ -469,11 +482,7 @@ def sums(values):
     while left > 1:
         # Group g of a vector holds the partial sums of four of them; the groups of one vector are added in
         # pairs.
-        low, high = (
-            [side * LANES + 4 * g + j for side in (0, 1) for g in range(first, fours, 2) for j in range(4)]
-            for first in (0, 1)
-        )
-        vectors = halve(low, high)
+        vectors = halve(every_second_four(0), every_second_four(1))
         left = left // 2
     assert len(vectors) == 1
     return vectors[0]
@@ -488,14 +497,19 @@ def _polynomial(coefficients, x):
 
 _ROUND = 1.5 * 2**23
 """Added to a small number, the sum's last bits are the rounded number."""
-# 2^x on [-1/2, 1/2]: polynomials of least relative error, in the mean, at Chebyshev points.
-_POINTS = np.cos(np.pi * (np.arange(400) + 0.5) / 400) / 2
-_EXP2 = {
-    degree: np.linalg.lstsq(
-        _POINTS[:, None] ** np.arange(degree + 1) / np.exp2(_POINTS)[:, None], np.ones(400), rcond=None
-    )[0]
-    for degree in (3, 5)
-}
+_FITTED_POINTS = 400
+"""Chebyshev points that the polynomial of 2^x is fitted to; by eye."""
+
+
+def _exp2_polynomial(degree):
+    """2^x on [-1/2, 1/2]: the polynomial of least relative error, in the mean, at Chebyshev points."""
+    points = np.cos(np.pi * (np.arange(_FITTED_POINTS) + 0.5) / _FITTED_POINTS) / 2
+    powers = points[:, None] ** np.arange(degree + 1)
+    return np.linalg.lstsq(powers / np.exp2(points)[:, None], np.ones(_FITTED_POINTS), rcond=None)[0]
+
+
+_EXP2 = {degree: _exp2_polynomial(degree) for degree in (3, 5)}
+"""Relative error 1.1e-4 and 3e-7."""
 
 
 def exp2(x, degree=5):
@@ -512,6 +526,7 @@ def exp2(x, degree=5):
     return Vector(build, build.bitcast(build.add(exponent, value), _floats(lanes)))
 
 
+# log2(1 + m) / m for 1 + m from 2^-0.5 to 2^0.5, of degree 8: error 3e-7.
 _LOG2 = (
     np.polynomial.chebyshev.Chebyshev.interpolate(
         lambda m: np.log2(1 + m) / np.where(np.abs(m) < 1e-9, 1, m), 8, [0.5**0.5 - 1, 2**0.5 - 1]

@@ -37,6 +37,10 @@ def sources(folder: Path = Path(__file__).parent) -> str:
     return hashlib.sha256(b"".join(text for text in texts if b"\nimport torch" not in text)).hexdigest()
 
 
+_AT_HOME = "UserWideCacheLocator"
+"""Ending of the name of numba's class for a folder in the home; releases differ in an underscore before it."""
+
+
 class _KernelFiles(CompileResultCacheImpl):
     """Numba's choice of a folder, but none in the home of a user who has no home: the folder would be named
     ~, in the working directory.
@@ -45,9 +49,7 @@ class _KernelFiles(CompileResultCacheImpl):
     def __init__(self, function):
         if cache_home() is None:
             found = CompileResultCacheImpl._locator_classes
-            self._locator_classes = [
-                each for each in found if not each.__name__.endswith("UserWideCacheLocator")
-            ]
+            self._locator_classes = [each for each in found if not each.__name__.endswith(_AT_HOME)]
         super().__init__(function)
 
 

@@ -33,11 +33,10 @@ AXES = ((0, 1), (0, 2), (1, 2))
 """Axes that each plane spans, along its rows first."""
 _LANES = 8
 """Channels of the kernels' vectors."""
-_SLICES = 4
-_SMALL = 2**19
-"""Parts of the points whose gradients are summed apart, and numbers of a table below which that is worth the
-memory.
-"""
+_GRADIENT_SLICES = 4
+"""Parts of the points whose gradients are summed apart; by eye."""
+_MAX_SLICED_NUMBERS = 2**19
+"""Numbers of a table up to which that is worth the memory: 2 MiB a part; by eye."""
 
 
 def rows(resolutions: Sequence[int]) -> int:
@@ -192,7 +191,11 @@ class _Lookup(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             # A table of few scales gives few tasks, so a small one is summed up in parts. Sizes alone decide:
             # the order of the sums must not depend on the machine.
-            slices = _SLICES if table.numel() <= _SMALL and grads[0].numel() > table.numel() else 1
+            slices = (
+                _GRADIENT_SLICES
+                if table.numel() <= _MAX_SLICED_NUMBERS and grads[0].numel() > table.numel()
+                else 1
+            )
             parts = torch.zeros(slices, *table.shape)
             kernels.backward(*given, slices, parts.view(-1).numpy())
             to_table = parts.sum(0) if slices > 1 else parts[0]

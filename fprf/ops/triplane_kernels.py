@@ -65,9 +65,11 @@ def _samples(table, bases, step, stride, shares):
     values = []
     slopes = []
     for base, (across, down) in zip(bases, AXES, strict=True):
-        (a, b), (c, d) = (
-            [load(table, at + k, shares[0].lanes) for k in (0, step)] for at in (base, base + stride)
-        )
+        lanes = shares[0].lanes
+        a = load(table, base, lanes)
+        b = load(table, base + step, lanes)
+        c = load(table, base + stride, lanes)
+        d = load(table, base + stride + step, lanes)
         upper = mix(a, b, shares[across])
         lower = mix(c, d, shares[across])
         values.append(mix(upper, lower, shares[down]))
@@ -106,10 +108,9 @@ def product_slopes(table, grad, sums, a, b, c, o, step, stride, u, v, w):
         table, (a, b, c), step, stride, [narrow(share, NARROW) for share in (u, v, w)]
     )
     g = load(grad, o, NARROW)
+    others = (y * z, x * z, x * y)
     for axis in range(3):
-        first, second = (
-            s[axis] * rest for s, rest in zip(slopes, (y * z, x * z, x * y), strict=True) if axis in s
-        )
+        first, second = (s[axis] * rest for s, rest in zip(slopes, others, strict=True) if axis in s)
         at = axis * NARROW
         store(sums, at, load(sums, at, NARROW) + g * (first + second))
 

@@ -13,12 +13,13 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+# Kinds of lens: numbers in the files of a run.
 PINHOLE = 0
-OPENCV = 1
-FISHEYE = 2
-_TOLERANCE = 1e-14
+OPENCV = 1  # k1 k2 k3 k4 p1 p2
+FISHEYE = 2  # k1 k2 k3 k4 of the angle
+_MAX_INVERSE_ERROR = 1e-14
 """Error of the inverse in focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""
-_STEPS = 60
+_MAX_ITERATIONS = 60
 """Bisection alone halves a bracket to rounding in that many; Newton mostly needs five."""
 
 
@@ -57,17 +58,17 @@ def _radial_inverse(k: Tensor, u: Tensor, reach: Tensor) -> Tensor:
     low = torch.zeros_like(u)
     # Without a turning point u grows without bound: double until the bracket holds the root.
     high = torch.where(torch.isfinite(reach), reach, u.clamp_min(1e-3))
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         short = (_powers(k, high)[0] * high < u) & (high < reach)
         if not short.any():
             break
         high = torch.where(short, torch.minimum(2 * high, reach), high)
     beyond = _powers(k, high)[0] * high <= u
     rho = torch.minimum(u, high)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         share, slope = _powers(k, rho)
         error = share * rho - u
-        done = (error.abs() <= _TOLERANCE * (1 + u)) | beyond
+        done = (error.abs() <= _MAX_INVERSE_ERROR * (1 + u)) | beyond
         if bool(done.all()):
             break
         high = torch.where(error > 0, rho, high)
@@ -97,11 +98,11 @@ def _brown_newton(distortion: Tensor, xy: Tensor, target: Tensor, reach: Tensor)
     solved = xy.clone()
     live = torch.arange(len(xy), device=xy.device)
     keep = torch.ones_like(live, dtype=torch.bool)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         error = _brown(distortion, xy) - target
         # Solved pixels leave: most need few steps, and stragglers shall not pay for all.
         size = error.norm(dim=-1)
-        keep &= size > _TOLERANCE * (1 + target.norm(dim=-1))
+        keep &= size > _MAX_INVERSE_ERROR * (1 + target.norm(dim=-1))
         if not bool(keep.any()):
             break
         live = live[keep]

@@ -19,10 +19,10 @@ from ..io.atomic import write_json
 from ..io.strict_json import parse_json
 from ..types import Origin
 
-_FAR = 16.0
+_MAX_EXTENTS = 16.0
 """Distance from 0, in extents, up to which the origin is 0: float32 then resolves 1e-6 of the extent."""
-_MOST = 1 << 16
-"""Places that are looked at, about."""
+_MAX_SAMPLED_PLACES = 1 << 16
+"""Places that are looked at, about; by eye."""
 
 
 def local_origin(place: Annotated[Tensor, "N 3"], around: Annotated[Tensor, "P 3"] | None = None) -> Origin:
@@ -34,7 +34,7 @@ def local_origin(place: Annotated[Tensor, "N 3"], around: Annotated[Tensor, "P 3
     middle, extent = extent_of(place)
     if around is not None and len(around := _some(around)):
         extent = max(extent, float((around - middle).norm(dim=1).median()))
-    if not 0 < _FAR * extent < float(middle.norm()):
+    if not 0 < _MAX_EXTENTS * extent < float(middle.norm()):
         return (0.0, 0.0, 0.0)
     step = 2.0 ** math.floor(math.log2(extent))
     x, y, z = ((middle / step).round() * step + 0.0).tolist()  # + 0.0: no negative zero
@@ -54,7 +54,7 @@ def extent_of(place: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "3"], 
 
 def _some(place: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "M 3"]:
     """Finite places at equal steps, float64."""
-    place = place[:: max(1, len(place) // _MOST)].double()
+    place = place[:: max(1, len(place) // _MAX_SAMPLED_PLACES)].double()
     return place[place.isfinite().all(1)]
 
 

@@ -32,11 +32,14 @@ from .cameras import Cameras, ideal_cameras
 from .lens import FISHEYE, OPENCV, PINHOLE
 from .splines import catmull_rom, quaternions, rotations, slerp
 
-_TURNS = 2
-_SHRINKS = 64
-"""Of a spiral: its turns, and steps in which it shrinks until it stays near the cameras."""
+_SPIRAL_TURNS = 2
+"""As in the spirals of LLFF."""
+_PARALLEL_SPREADS = 4
+"""Distance, in baselines, at which cameras with parallel axes are taken to look; by eye."""
+_MAX_SPIRAL_SHRINKS = 64
+"""Steps in which a spiral shrinks until it stays near the cameras; by eye."""
 _MODELS = {FISHEYE: "OPENCV_FISHEYE", OPENCV: "OPENCV"}
-_STRAY = 1e-3
+_MAX_ROTATION_ERROR = 1e-3
 """Tolerance of a rotation's orthonormality: viewers round to a few digits."""
 _Matrix = Annotated[list[Annotated[float, Meta(gt=-1e30, lt=1e30)]], Meta(min_length=16, max_length=16)]
 _Side = Annotated[float, Meta(ge=1, le=65536, multiple_of=1)]
@@ -81,16 +84,20 @@ def spiral(cameras: Cameras, frames: int) -> Cameras:
     spread = ((centres - start) @ rotation).abs().quantile(0.9, dim=0)
     # Beyond a third of the depth the view would swing by more than 18 degrees, or pass what it looks at.
     radii = spread.clamp(max=depth / 3)
-    angle = torch.arange(frames, dtype=centres.dtype, device=centres.device) * (2 * math.pi * _TURNS / frames)
-    loop = (torch.stack([angle.cos(), angle.sin(), (angle / _TURNS).sin()], dim=-1) * radii) @ rotation.T
+    angle = torch.arange(frames, dtype=centres.dtype, device=centres.device) * (
+        2 * math.pi * _SPIRAL_TURNS / frames
+    )
+    loop = (
+        torch.stack([angle.cos(), angle.sin(), (angle / _SPIRAL_TURNS).sin()], dim=-1) * radii
+    ) @ rotation.T
     # The distance from a camera to the nearest other one, such that nine in ten are closer.
     others = apart + torch.diag(torch.full_like(apart[0], torch.inf))
     if len(cameras) == 1:
         reach = 1.0
     else:
         reach = float(others.amin(dim=-1).quantile(0.9))
-    for step in range(_SHRINKS):
-        position = start + loop * (1 - step / _SHRINKS)
+    for step in range(_MAX_SPIRAL_SHRINKS):
+        position = start + loop * (1 - step / _MAX_SPIRAL_SHRINKS)
         if float(torch.cdist(position, centres).amin(dim=-1).amax()) <= reach:
             break
     target = (start - rotation[:, 2] * depth).expand_as(position)
@@ -234,14 +241,14 @@ def _focus_depth(cameras: Cameras, view: int) -> float:
     """Depth along the axis of a view at which what it shows lies: where the optical axes meet."""
     pose = cameras.pose[view]
     target = _meeting(cameras.pose)
-    if target is None:
-        ahead = 0.0
-    else:
+    if target is not None:
         ahead = float((pose[:, 3] - target) @ pose[:, 2])
-    spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
+        if ahead > 0:
+            return ahead
     # Parallel axes show something far away compared with the baseline, as in any capture that can be
     # reconstructed.
-    return ahead if ahead > 0 else (4 * spread if spread > 0 else 1.0)
+    spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
+    return _PARALLEL_SPREADS * spread if spread > 0 else 1.0
 
 
 MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
@@ -340,7 +347,7 @@ def _orthonormal(where: str, matrix: _Matrix) -> Annotated[Tensor, "3 4"]:
     pose = torch.tensor(matrix, dtype=torch.float64).view(4, 4)[:3]
     left, scales, right = torch.linalg.svd(pose[:, :3])
     turn = left @ right
-    if float((scales - 1).abs().max()) > _STRAY or float(torch.linalg.det(turn)) < 0:
+    if float((scales - 1).abs().max()) > _MAX_ROTATION_ERROR or float(torch.linalg.det(turn)) < 0:
         raise msgspec.ValidationError(
             f"Expected a rotation and a position, without scale or mirroring - at `{where}`"
         )

@@ -167,6 +167,25 @@ def composite_mean(
     return composite(kept, values, rays) / mass.clamp_min(1e-10)
 
 
+class TrainingStep(NamedTuple):
+    """What rendering is told in training."""
+
+    step: int | None = None
+    """None = what is rendered is only shown: samples are drawn as they are for views."""
+    generator: torch.Generator | None = None
+    """Of the step's draws."""
+    semantic_rays: int | None = None
+    """Semantics are rendered for so many of the first rays; None = all."""
+    semantic_samples: int | None = None
+    """From so many of the heaviest samples of each; None = all."""
+    content_moves_density: bool = True
+    """False = content features are composited with detached weights."""
+
+
+RENDERED_ONLY = TrainingStep()
+"""Nothing is trained."""
+
+
 def render_rays(
     rays: Rays,
     parts: Parts,
@@ -175,20 +194,15 @@ def render_rays(
     budget: float,
     background: Annotated[Tensor, "3"] | None = None,
     restyle: "Restyle | None" = None,
-    step: int | None = None,
-    generator: torch.Generator | None = None,
-    semantic_rays: int | None = None,
-    semantic_samples: int | None = None,
-    content_moves_density: bool = True,
+    training: TrainingStep = RENDERED_ONLY,
 ) -> Rendered:
-    """Render what is wanted. `step` is given in training alone.
+    """Render what is wanted.
 
-    Semantics are rendered with detached weights (the semantic loss never moves density), for the first
-    `semantic_rays` rays from their `semantic_samples` heaviest samples, whose weights are scaled up to the
-    ray's opacity. Content features are composited with detached weights too unless they may move density.
+    Semantics are rendered with detached weights (the semantic loss never moves density), from the heaviest
+    samples of a ray, whose weights are scaled up to the ray's opacity.
     """
     # Geometry, which no style touches.
-    marched = march(rays, parts, budget=budget, step=step, generator=generator)
+    marched = march(rays, parts, budget=budget, step=training.step, generator=training.generator)
     kept = marched.kept
     count = len(rays.near)
     rgb = content = semantic = None
@@ -199,7 +213,7 @@ def render_rays(
         if kept.gradient_scale is not None:
             features = scale_gradient(features, kept.gradient_scale[:, None])
         if Want.CONTENT in want:
-            if content_moves_density:
+            if training.content_moves_density:
                 fixed = kept
             else:
                 fixed = kept._replace(weight=kept.weight.detach())
@@ -218,8 +232,8 @@ def render_rays(
             marched,
             _detached(rays),
             parts,
-            count if semantic_rays is None else semantic_rays,
-            semantic_samples,
+            count if training.semantic_rays is None else training.semantic_rays,
+            training.semantic_samples,
         )
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
     return Rendered(

@@ -45,7 +45,7 @@ from ..plugins.executors.config import ExecutorConfig
 from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
-from ..rendering.renderer import render_rays
+from ..rendering.renderer import TrainingStep, render_rays
 from ..types import Batch, Rays, Rendered, Sampled, Want
 from . import cases
 from .outputs import (
@@ -520,8 +520,7 @@ def check_loss_term(config: LossTermConfig) -> None:
         parts,
         want=Want.DENSITY | term.needs,
         budget=0.0,
-        step=10,
-        semantic_rays=count // 2,
+        training=TrainingStep(step=10, semantic_rays=count // 2),
     )
     assert rendered.weights is not None
     bare = cases.batch(count)._replace(content=None, semantic=None)

@@ -21,7 +21,7 @@ from ..plugins.samplers.config import ProposalConfig
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
-from ..rendering.renderer import render_rays
+from ..rendering.renderer import TrainingStep, render_rays
 from ..rendering.space import Space
 from ..style.dictionary import Reference, build_dictionary
 from ..style.look import Restyle, colour_maps
@@ -132,7 +132,11 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
     gradients: list[Tensor] = []
     for _ in range(2):
         out = render_rays(
-            rays, model.parts, want=Want.COLOUR | Want.CONTENT | Want.SEMANTIC, budget=0.0, step=0
+            rays,
+            model.parts,
+            want=Want.COLOUR | Want.CONTENT | Want.SEMANTIC,
+            budget=0.0,
+            training=TrainingStep(step=0),
         )
         assert out.rgb is not None and out.content is not None and out.semantic is not None
         target = torch.nn.functional.interpolate(image[None], (24, 32))[0].flatten(1).T

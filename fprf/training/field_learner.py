@@ -25,7 +25,7 @@ from ..memory import free_memory
 from ..ops.backend import tf32
 from ..progress import Display
 from ..rendering.cameras import PixelRays
-from ..rendering.renderer import render_rays
+from ..rendering.renderer import TrainingStep, render_rays
 from ..scenes import SceneLearner
 from ..style.scene_style import to_tensors
 from ..types import Batch, Rays
@@ -139,11 +139,13 @@ class FieldLearner(SceneLearner):
             want=wanted(self.config.loss, batch, self.extra),
             budget=self.config.render.train_budget,
             background=self.background,
-            step=step + self.lead,
-            generator=draws,
-            semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
-            semantic_samples=self.config.semantic.samples,
-            content_moves_density=self.config.content.moves_density,
+            training=TrainingStep(
+                step=step + self.lead,
+                generator=draws,
+                semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
+                semantic_samples=self.config.semantic.samples,
+                content_moves_density=self.config.content.moves_density,
+            ),
         )
         # Photographs differ in exposure: what is compared is the render as the view would have taken it.
         if self.model.tones is not None and rendered.rgb is not None:

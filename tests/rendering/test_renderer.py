@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import ContentField, Decoder, Parts, SemanticField, Stylizer
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
-from fprf.rendering.renderer import march, render_rays
+from fprf.rendering.renderer import TrainingStep, march, render_rays
 from fprf.rendering.space import Kind, Space
 from fprf.rendering.stepfun import midpoints
 from fprf.style.look import Restyle
@@ -221,7 +221,7 @@ def gradients(loss: Tensor, module: nn.Module) -> list[Tensor | None]:
 def test_semantics_never_move_density() -> None:
     parts = parts_of(proposal=True)
     rays = rays_of("contraction", 12)
-    found = render_rays(rays, parts, want=ALL, budget=0.0, step=0, semantic_samples=4)
+    found = render_rays(rays, parts, want=ALL, budget=0.0, training=TrainingStep(step=0, semantic_samples=4))
     assert found.semantic is not None and found.rgb is not None and parts.semantic is not None
     assert all(g is None for g in gradients(found.semantic.square().sum(), parts.field))
     assert all(g is None for g in gradients(found.semantic.square().sum(), parts.sampler))
@@ -233,7 +233,7 @@ def test_semantics_never_move_density() -> None:
 def test_content_moves_density_only_where_it_may(moves: bool) -> None:
     parts = parts_of()
     rays = rays_of("contraction", 12)
-    found = render_rays(rays, parts, want=ALL, budget=0.0, content_moves_density=moves)
+    found = render_rays(rays, parts, want=ALL, budget=0.0, training=TrainingStep(content_moves_density=moves))
     assert found.content is not None and found.rgb is not None
     reached = dict(
         zip(
@@ -280,9 +280,8 @@ def test_a_background_is_seen_through_and_density_learns_from_it(density: float)
 def test_semantics_of_some_rays_and_samples_keep_the_opacity(samples: int | None, count: int | None) -> None:
     parts = parts_of()._replace(semantic=Ones())
     rays = rays_of("contraction", 9)
-    found = render_rays(
-        rays, parts, want=Want.SEMANTIC, budget=0.0, semantic_rays=count, semantic_samples=samples
-    )
+    some = TrainingStep(semantic_rays=count, semantic_samples=samples)
+    found = render_rays(rays, parts, want=Want.SEMANTIC, budget=0.0, training=some)
     assert found.semantic is not None
     assert found.semantic.shape == (9 if count is None else count, 3)
     wanted = found.opacity[: len(found.semantic), None].expand_as(found.semantic)

@@ -14,7 +14,7 @@ from fprf.config import LossConfig
 from fprf.errors import ConfigError, PluginError
 from fprf.interfaces import LossTerm, Parts
 from fprf.plugins.losses.config import LossTermConfig
-from fprf.rendering.renderer import render_rays
+from fprf.rendering.renderer import TrainingStep, render_rays
 from fprf.training.losses import check_penalties, emptiness, ending, extra_term, terms, total, wanted
 from fprf.training.model import Model, build_model
 from fprf.types import Batch, Rendered, Want
@@ -32,10 +32,12 @@ def rendered(world: World, model: Model, batch: Batch, config: LossConfig) -> Re
         model.parts,
         want=wanted(config, batch),
         budget=0.0,
-        step=0,
-        semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
-        semantic_samples=2,
-        content_moves_density=False,
+        training=TrainingStep(
+            step=0,
+            semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
+            semantic_samples=2,
+            content_moves_density=False,
+        ),
     )
 
 
@@ -144,7 +146,7 @@ def test_a_term_of_a_package_counts(world: World) -> None:
         model.parts,
         want=wanted(config, batch, extra),
         budget=0.0,
-        step=0,
+        training=TrainingStep(step=0),
     )
     found = terms(config, world.prepared.facts, out, batch, model, step=7, extra=extra)
     assert out.weights is not None and set(found) == {"rgb", "extra"}

@@ -29,11 +29,13 @@ from ..simd import (
     where_greater,
 )
 from ..threads import on_threads, take
-from . import BLUR, MAX_ALPHA
+from . import ADAM_DECAYS, ADAM_EPSILON, BLUR, MAX_ALPHA, MAX_SQUARE_PIXELS
 from .forward_kernels import (
+    CHUNK,
     SIDE,
     SLOTS,
     TILE,
+    Channels,
     Tiles,
     alpha_of,
     axes,
@@ -47,15 +49,15 @@ from .forward_kernels import (
 from .layout import BLOCKS, FIXED, Floats, basis, colour, direction, direction_slopes, jit
 
 SUMS = LANES
+"""Floats that are kept of an entry: a vector."""
 GEOMETRY = 6
 """Sums of an entry that are about its shape; those of channels follow."""
 CAMERA = 6
 """Degrees of freedom of a camera."""
 _LOG_MAX = math.log2(MAX_ALPHA)
-_HUGE = 1e16
-_BETAS = 0.9, 0.99
-"""Of Adam's moments."""
-_BLOCK = SUMS * LANES
+"""log2 alpha above which it is cut."""
+_FIRST_DECAY, _SECOND_DECAY = ADAM_DECAYS
+_BLOCK_SUMS = SUMS * LANES
 
 
 @traced
@@ -157,7 +159,7 @@ def _composite_back(channels, geometry):
             end = start[tile + 1]
             unsaturated = 0xFFFF
             while k < end and unsaturated != 0:
-                stop = min(k + 32, end)
+                stop = min(k + CHUNK, end)
                 for q in range(k, stop):
                     todo = blocks[q] & unsaturated
                     summed = _nothing(memory, count)
@@ -179,31 +181,33 @@ def _composite_back(channels, geometry):
     return composite_back
 
 
+# By the number of channels: one is compiled when it is first called.
 _COMPOSITE_BACK = {channels: _composite_back(channels, 1) for channels in (3, 4, 8)}
+# Of features alone, without the sums of the shape.
 _LIFT = {channels: _composite_back(channels, 0) for channels in (8, SUMS)}
 
 
 def composite_back(
-    tiles: Tiles, channels: int, values: Floats, stride: int, offset: int,
-    out: Floats, left: Floats, grad: Floats, grad_left: Floats,
-) -> Floats:  # fmt: skip
+    tiles: Tiles, channels: Channels, out: Floats, left: Floats, grad: Floats, grad_left: Floats
+) -> Floats:
     """SUMS of each slot, from the planes of `composite` and their gradients, both padded to whole tiles."""
-    return _summed(_COMPOSITE_BACK[channels], tiles, values, stride, offset, out, left, grad, grad_left)
+    return _summed(_COMPOSITE_BACK[channels.number], tiles, channels, out, left, grad, grad_left)
 
 
-def lift(tiles: Tiles, channels: int, pixels: Floats) -> Floats:
+def lift(tiles: Tiles, count: int, pixels: Floats) -> Floats:
     """SUMS of each slot that begin with those of 8 or 16 channels, of weight times pixel; there are none of
     the shape.
     """
     nothing = np.empty(0, np.float32)
-    return _summed(_LIFT[channels], tiles, tiles.splats, SLOTS, 0, nothing, nothing, pixels, nothing)
+    channels = Channels(count, tiles.splats, SLOTS, 0)
+    return _summed(_LIFT[count], tiles, channels, nothing, nothing, pixels, nothing)
 
 
-def _summed(kernel: Any, tiles: Tiles, values: Floats, stride: int, offset: int, *planes: Floats) -> Floats:
+def _summed(kernel: Any, tiles: Tiles, channels: Channels, *planes: Floats) -> Floats:
     sums = aligned((len(tiles.ids) + 1) * SUMS)
     on_threads(
-        kernel, tiles.start, tiles.ids, tiles.slots, tiles.blocks, tiles.splats, values, stride, offset,
-        tiles.width, tiles.height, *planes, sums,
+        kernel, tiles.start, tiles.ids, tiles.slots, tiles.blocks, tiles.splats,
+        channels.values, channels.stride, channels.first, tiles.width, tiles.height, *planes, sums,
     )  # fmt: skip
     return sums
 
@@ -262,7 +266,7 @@ def _block_gradient(blocks, at, bands, view, summed):
     invert = 1 / det
     s0, sx, sxx, sy, sxy, syy, red, green, blue, depth = summed[:10]
     # What is not drawn has sums of 0, but may have infinite factors.
-    drawn = where_greater(centre[2], view[23], where_greater(_HUGE, xx + yy, splat(xx, 1), 0), 0)
+    drawn = where_greater(centre[2], view[23], where_greater(MAX_SQUARE_PIXELS, xx + yy, splat(xx, 1), 0), 0)
 
     # Image position and covariance.
     ca = yy * invert
@@ -308,25 +312,23 @@ def _block_gradient(blocks, at, bands, view, summed):
     b0 = -(near_u * h00 + near_v * h10)
     b1 = -(near_u * h01 + near_v * h11)
     b2 = -(near_u * h02 + near_v * h12)
-    n = [
-        [
-            view[r] * h0 + view[3 + r] * h1 + view[6 + r] * b
-            for h0, h1, b in ((h00, h10, b0), (h01, h11, b1), (h02, h12, b2))
-        ]
-        for r in range(3)
-    ]
+    columns = ((h00, h10, b0), (h01, h11, b1), (h02, h12, b2))
+    n = []
+    for r in range(3):
+        n.append([view[r] * h0 + view[3 + r] * h1 + view[6 + r] * b for h0, h1, b in columns])
     of_scales = [n[0][c] * world[c] + n[1][c] * world[3 + c] + n[2][c] * world[6 + c] for c in range(3)]
     pairs = [(centre, (g_x, g_y, g_z))]
-    pairs += [(camera[c::3], g) for c, g in enumerate(((h00, h10, b0), (h01, h11, b1), (h02, h12, b2)))]
-    of_turn = [
-        sum(g[(r + 1) % 3] * a[(r + 2) % 3] - g[(r + 2) % 3] * a[(r + 1) % 3] for a, g in pairs)
-        for r in range(3)
-    ]
+    pairs += [(camera[c::3], g) for c, g in enumerate(columns)]
+    of_turn = []
+    for r in range(3):
+        after = (r + 1) % 3
+        before = (r + 2) % 3
+        of_turn.append(sum(g[after] * a[before] - g[before] * a[after] for a, g in pairs))
 
     # Quaternion: of the unit one, then across it.
-    (n00, n01, n02), (n10, n11, n12), (n20, n21, n22) = (
-        [each * s for each, s in zip(row, scales, strict=True)] for row in n
-    )
+    n00, n01, n02 = (each * s for each, s in zip(n[0], scales, strict=True))
+    n10, n11, n12 = (each * s for each, s in zip(n[1], scales, strict=True))
+    n20, n21, n22 = (each * s for each, s in zip(n[2], scales, strict=True))
     kw = 2 * (qx * (n21 - n12) + qy * (n02 - n20) + qz * (n10 - n01))
     kx = 2 * (qy * (n01 + n10) + qz * (n02 + n20) + qw * (n21 - n12) - 2 * qx * (n11 + n22))
     ky = 2 * (qx * (n01 + n10) + qz * (n12 + n21) + qw * (n02 - n20) - 2 * qy * (n00 + n22))
@@ -337,19 +339,24 @@ def _block_gradient(blocks, at, bands, view, summed):
     # Colour: no gradient where it is cut at 0.
     dx, dy, dz, shrink = direction(mean, view)
     values = basis(dx, dy, dz, bands)
+    uncut = colour(blocks, at, values)
     colours = [
-        where_greater(was, 0, slope, 0)
-        for was, slope in zip(colour(blocks, at, values), (red, green, blue), strict=True)
+        where_greater(uncut[0], 0, red, 0),
+        where_greater(uncut[1], 0, green, 0),
+        where_greater(uncut[2], 0, blue, 0),
     ]
-    gx, gy, gz = direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
+    gx, gy, gz = direction_slopes((dx, dy, dz), bands, blocks, at, colours)
     along = gx * dx + gy * dy + gz * dz
-    of_means = [
-        view[r] * g_x + view[3 + r] * g_y + view[6 + r] * g_z + (g - d * along) * shrink
-        for r, (g, d) in enumerate(((gx, dx), (gy, dy), (gz, dz)))
-    ]
+    of_means = []
+    for r, (g, d) in enumerate(((gx, dx), (gy, dy), (gz, dz))):
+        of_place = view[r] * g_x + view[3 + r] * g_y + view[6 + r] * g_z
+        of_means.append(of_place + (g - d * along) * shrink)
     of_shape = [where_greater(drawn, 0, each, 0) for each in (*of_means, *of_scales, *of_quaternion)]
-    of_camera = [where_greater(drawn, 0, each, 0) for each in (*of_turn, *(-each for each in of_means))]
-    of_colours = (b * each for b in values for each in colours)
+    of_shift = [-each for each in of_means]
+    of_camera = [where_greater(drawn, 0, each, 0) for each in (*of_turn, *of_shift)]
+    of_colours = []
+    for b in values:
+        of_colours += [b * each for each in colours]
     return [*of_shape, s0 * (1 - opacity(load(blocks, at + 10 * LANES))), *of_colours], of_camera
 
 
@@ -358,7 +365,7 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
     at = start * (FIXED + 3 * bands)
     # Adam, whose second moment is weighted by how often a Gaussian was seen.
     w = load(weight, start)
-    w = w + (1 - _BETAS[1]) * (1 - w)
+    w = w + (1 - _SECOND_DECAY) * (1 - w)
     store(weight, start, w)
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
     rows, of_view = _block_gradient(blocks, at, bands, view, [*summed, 0])
@@ -368,11 +375,11 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
         o = at + row * LANES
         m = load(first, o)
         s = load(second, o)
-        m = m + (1 - _BETAS[0]) * (g - m)
-        s = s + (1 - _BETAS[1]) * (g * g - s)
+        m = m + (1 - _FIRST_DECAY) * (g - m)
+        s = s + (1 - _SECOND_DECAY) * (g * g - s)
         store(first, o, m)
         store(second, o, s)
-        store(blocks, o, load(blocks, o) - rates[row] * m / (square_root(s / w) + 1e-15))
+        store(blocks, o, load(blocks, o) - rates[row] * m / (square_root(s / w) + ADAM_EPSILON))
 
 
 @traced
@@ -394,7 +401,7 @@ def _add_block(found, first_slot, first, memory):
 def _gradients(bands):
     @jit
     def gradients(counters, blocks, count, view, found, first_slot, out):
-        memory = stack(_BLOCK)
+        memory = stack(_BLOCK_SUMS)
         while True:
             begin = take(counters, 0) * BLOCKS * LANES
             if begin >= count:
@@ -414,7 +421,7 @@ def _gradients(bands):
 def _adam(bands):
     @jit
     def adam(counters, blocks, first, second, weight, count, view, found, first_slot, rates, of_camera):
-        memory = stack(_BLOCK)
+        memory = stack(_BLOCK_SUMS)
         while True:
             begin = take(counters, 0) * BLOCKS * LANES
             if begin >= count:
@@ -427,7 +434,9 @@ def _adam(bands):
     return adam
 
 
+# By the number of harmonics.
 _GRADIENTS = {bands: _gradients(bands) for bands in (1, 4, 9, 16)}
+# By the number of harmonics.
 _ADAM = {bands: _adam(bands) for bands in (1, 4, 9, 16)}
 
 

@@ -44,28 +44,35 @@ from ..simd import (
     where_greater,
 )
 from ..threads import on_threads, take
-from . import BLUR, MAX_ALPHA, MIN_ALPHA
-from .layout import BLOCKS, FIXED, MARK, Floats, basis, colour, direction, jit
+from . import BLUR, MAX_ALPHA, MAX_SQUARE_PIXELS, MIN_ALPHA
+from .layout import BLOCKS, FIXED, MARK, MIN_SQUARED_NORM, Floats, basis, colour, direction, jit
 
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
 SLOTS = 16
+"""Numbers of a splat: a vector, though 16 are used."""
 SIDE = 16
-"""Numbers of a splat; pixels of a tile's side."""
+"""Pixels of a tile's side: 16 blocks of 4 x 4, one bit of an integer each."""
 STOP = 1e-3
-"""Blocks of a tile through which no more than this share of light passes are left alone."""
-FAINT = 0
-BEHIND = 1
-OUTSIDE = 2
-INVALID = 3
+"""Blocks of a tile through which no more than this share of light passes are left alone: an error of at most
+a quarter of a step of 8 bits.
+"""
+CHUNK = 32
+"""Entries of a tile between looks at which of its blocks light still passes; by eye."""
+# Why there is nothing to draw: places in `Tiles.skipped`.
+FAINT = 0  # alpha stays below MIN_ALPHA
+BEHIND = 1  # the camera
+OUTSIDE = 2  # the image
+INVALID = 3  # not finite, or too large
 
 _f = np.float32
 _LOG2E = 1 / math.log(2)
+"""e^x = 2^(x _LOG2E)."""
 _LN2 = math.log(2)
+"""ln x = _LN2 log2 x."""
 LOG_MIN = _f(math.log2(MIN_ALPHA))
-_ZERO = _f(0)
+"""log2 alpha that counts as 0."""
+_ZERO = _f(0)  # a float32, as what it is compared with
 _VECTOR = LANES
-_HUGE = 1e16
-"""Square pixels beyond which a Gaussian is invalid."""
 
 
 def axes(blocks, at, view):
@@ -77,7 +84,7 @@ def axes(blocks, at, view):
     centre = [view[3 * r] * x + view[3 * r + 1] * y + view[3 * r + 2] * z + view[9 + r] for r in range(3)]
     # The unit quaternion; one of zeros is no rotation.
     w, x, y, z = (load(blocks, at + c * LANES) for c in range(6, 10))
-    shrink = 1 / square_root(maximum(w * w + x * x + y * y + z * z, 1e-24))
+    shrink = 1 / square_root(maximum(w * w + x * x + y * y + z * z, MIN_SQUARED_NORM))
     w = w * shrink
     x = x * shrink
     y = y * shrink
@@ -90,11 +97,11 @@ def axes(blocks, at, view):
     # Columns of R S are the ellipsoid's half axes.
     scales = [exp2(load(blocks, at + c * LANES) * _LOG2E) for c in range(3, 6)]
     world = [rows[k] * scales[k % 3] for k in range(9)]
-    camera = [
-        view[3 * r] * world[c] + view[3 * r + 1] * world[3 + c] + view[3 * r + 2] * world[6 + c]
-        for r in range(3)
-        for c in range(3)
-    ]
+    camera = []
+    for r in range(3):
+        for c in range(3):
+            turned = view[3 * r] * world[c] + view[3 * r + 1] * world[3 + c] + view[3 * r + 2] * world[6 + c]
+            camera.append(turned)
     return mean, centre, scales, (w, x, y, z, shrink), world, camera
 
 
@@ -160,7 +167,7 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     shown = where_greater(py + half_height, 0, shown, -OUTSIDE)
     shown = where_greater(centre[2], view[23], shown, -BEHIND)
     shown = where_greater(reach, 0, shown, -FAINT)
-    shown = where_greater(_HUGE, xx + yy, shown, -INVALID)
+    shown = where_greater(MAX_SQUARE_PIXELS, xx + yy, shown, -INVALID)
     shown = where_greater(logit, 0.5 * MARK, shown, -INVALID)
     colours = (maximum(each, 0) for each in colour(blocks, at, basis(*direction(mean, view)[:3], bands)))
     # log2 alpha as a polynomial of the distance; a row of splats a Gaussian.
@@ -189,6 +196,7 @@ def _project(bands):
     return project
 
 
+# By the number of harmonics.
 _PROJECT = {bands: _project(bands) for bands in (1, 4, 9, 16)}
 
 
@@ -261,6 +269,12 @@ def _masks(first, last, column, memory):
     for k in range(4):
         bits = bits + where_greater(first, c + k, splat(c, 0), where_greater(c + k, last, splat(c, 0), 2**k))
     store(memory, 0, added_in_fours(bits * lanes(first, [16 ** (lane % 4) for lane in range(LANES)])))
+
+
+_ENTRIES_PER_GAUSSIAN = 4
+"""Tiles that a Gaussian reaches, about, in the first try; by eye."""
+_SPARE_ENTRIES = 1024
+"""Room beside it for views of few Gaussians; by eye."""
 
 
 @jit
@@ -384,7 +398,7 @@ def see(
     """
     on_threads(_PROJECT[bands], blocks, count, view, width, height, splats)
     tiles = ((width + SIDE - 1) // SIDE) * ((height + SIDE - 1) // SIDE)
-    room = 4 * count + 1024
+    room = _ENTRIES_PER_GAUSSIAN * count + _SPARE_ENTRIES
     first_slot = np.empty(count + 1 + LANES, np.int32)
     (seen, key, *others) = np.empty((4, count), np.int32)
     while True:
@@ -423,8 +437,9 @@ def see(
 
 
 TILE = SIDE * SIDE
+# Places of the pixels of a block of 4 x 4.
 _X = [k % 4 for k in range(LANES)]
-_Y = [k // 4 for k in range(LANES)]
+_Y = [k // 4 for k in range(LANES)]  # row by row
 
 
 def inside(like, bx, by, block, width, height):
@@ -495,10 +510,10 @@ def _finish(row, memory, background, channels, out, left, d, padded, area):
     for y, each in enumerate(swapped(blocks)):
         store(left, d + padded * y, each)
     for c in range(channels):
-        seen = [
-            load(memory, row * (4 * LANES) + k * LANES + (c + 1) * TILE) + blocks[k] * background[c]
-            for k in range(4)
-        ]
+        seen = []
+        for k in range(4):
+            summed = load(memory, row * (4 * LANES) + k * LANES + (c + 1) * TILE)
+            seen.append(summed + blocks[k] * background[c])
         for y, each in enumerate(swapped(seen)):
             store(out, area * c + d + padded * y, each)
 
@@ -530,7 +545,7 @@ def _composite(channels):
             end = start[tile + 1]
             unsaturated = 0xFFFF
             while k < end and unsaturated != 0:
-                stop = min(k + 32, end)
+                stop = min(k + CHUNK, end)
                 for q in range(k, stop):
                     todo = blocks[q] & unsaturated
                     if todo != 0:
@@ -553,26 +568,29 @@ def _composite(channels):
     return composite
 
 
+# By the number of channels.
 _COMPOSITE = {channels: _composite(channels) for channels in (3, 4, 8)}
 
 
-def composite(
-    tiles: Tiles,
-    channels: int,
-    values: Floats,
-    stride: int,
-    offset: int,
-    background: Floats,
-    out: Floats,
-    left: Floats,
-) -> int:
-    """Planes out [channels, H16, W16] of values[stride * i + offset ...] and the transmittance left [H16,
-    W16], both padded to whole tiles; returns how many entries were skipped because nothing passed any more.
-    Channels: 3, 4 or 8 at once.
+class Channels(NamedTuple):
+    """Channels that are composited at once: 3, 4 or 8 (16 in `lift`) numbers of each Gaussian, values[stride *
+    i + first ...].
     """
+
+    number: int
+    values: Floats
+    stride: int
+    first: int
+
+
+def composite(tiles: Tiles, channels: Channels, background: Floats, out: Floats, left: Floats) -> int:
+    """Planes out [channels, H16, W16] and the transmittance left [H16, W16], both padded to whole tiles;
+    returns how many entries were skipped because nothing passed any more.
+    """
+    count, values, stride, first = channels
     return sum(
         on_threads(
-            _COMPOSITE[channels], tiles.start, tiles.ids, tiles.blocks, tiles.splats, values, stride, offset, background,
+            _COMPOSITE[count], tiles.start, tiles.ids, tiles.blocks, tiles.splats, values, stride, first, background,
             tiles.width, tiles.height, out, left,
         )
     )  # fmt: skip

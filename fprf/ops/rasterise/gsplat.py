@@ -16,9 +16,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..photometric import WINDOW
+from ..photometric import SSIM_C1, SSIM_C2, WINDOW, WINDOW_SIGMA
 from ..simd import LANES
-from . import BLUR
+from . import ADAM_DECAYS, ADAM_EPSILON, BLUR, MAX_COORDINATE, MAX_LOG
 from .forward_kernels import SIDE
 from .layout import FIXED
 from .reference import Pinhole
@@ -35,20 +35,10 @@ from .training import (
     camera_array,
 )
 
-_MOST_LOG = 30.0
-_LARGE = 1e15
-"""Bounds of logarithms and logits, and of means and quaternions, as in `rasterise_reference`."""
-_BETAS = (0.9, 0.99)
-_EPS = 1e-15
-"""Decay of Adam's moments, and what keeps 0 / 0 from being NaN: those of `backward_kernels`."""
-_COLUMNS = 3, 3, 4, 1
+_PROPERTY_COLUMNS = (3, 3, 4, 1)
 """Columns of means, logarithms of scales, quaternions and logits; those of the harmonics follow."""
 _UPRIGHT = 1e-15
 """Added to w of a quaternion, so that one without a length is drawn, as if it turned nothing."""
-_SIGMA = 1.5
-_C1 = 0.01**2
-_C2 = 0.03**2
-"""SSIM: standard deviation of its window in pixels, and its two constants for colours in [0, 1]."""
 
 
 def usable(device: torch.device) -> bool:
@@ -120,9 +110,11 @@ def _guards(columns: int, like: Tensor) -> _Guards:
     most = np.full(columns, torch.finfo(like.dtype).max)
     harmless = np.zeros(columns)
     upright = np.zeros(4)
-    most[MEANS] = most[QUATERNION] = _LARGE
+    most[MEANS] = most[QUATERNION] = MAX_COORDINATE
     most[LOG_SCALES] = most[LOGIT] = np.inf  # these are cut
-    harmless[LOGIT], harmless[QUATERNION.start], upright[0] = -_MOST_LOG, 1, _UPRIGHT
+    harmless[LOGIT] = -MAX_LOG
+    harmless[QUATERNION.start] = 1
+    upright[0] = _UPRIGHT
     return _Guards(*(torch.from_numpy(each).to(like) for each in (most, harmless, upright)))
 
 
@@ -146,13 +138,13 @@ def _render(
     guards = guards or _guards(rows.shape[1], rows)
     fine = (rows.detach().abs() <= guards.most).all(1, keepdim=True)
     means, log_scales, quaternions, logits, values = torch.split(
-        torch.where(fine, rows, guards.harmless), [*_COLUMNS, rows.shape[1] - FIXED], 1
+        torch.where(fine, rows, guards.harmless), [*_PROPERTY_COLUMNS, rows.shape[1] - FIXED], 1
     )
     image, opacity, about = rasterization(
         means=means.contiguous(),
         quats=quaternions + guards.upright,
-        scales=log_scales.clamp(-_MOST_LOG, _MOST_LOG).exp(),
-        opacities=logits[:, 0].clamp(-_MOST_LOG, _MOST_LOG).sigmoid(),
+        scales=log_scales.clamp(-MAX_LOG, MAX_LOG).exp(),
+        opacities=logits[:, 0].clamp(-MAX_LOG, MAX_LOG).sigmoid(),
         colors=values.contiguous() if bands is None else values.reshape(-1, bands, 3),
         viewmats=camera.world_to_camera[None],
         Ks=camera.intrinsics[None],
@@ -222,9 +214,9 @@ class GsplatGaussians:
         self.rows = FIXED + 3 * bands
         self.device = device
         self.count = 0
-        self._values, self._first, self._second = (
-            torch.zeros(room, self.rows, device=device) for _ in range(3)
-        )
+        self._values = torch.zeros(room, self.rows, device=device)
+        self._first = torch.zeros_like(self._values)
+        self._second = torch.zeros_like(self._values)
         self._weight = torch.zeros(room, device=device)
         self._guards = _guards(self.rows, self._values)
 
@@ -286,7 +278,8 @@ class GsplatGaussians:
         """
         places = self._there(index)
         others = self._there(to)
-        self._values[places], self._values[others] = self._there(one), self._there(other)
+        self._values[places] = self._there(one)
+        self._values[others] = self._there(other)
         second = 0.5 * self._second[places]
         for each in (places, others):
             self._first[each] = torch.zeros_like(second)
@@ -365,21 +358,22 @@ class GsplatGaussians:
         """Move all of a block of LANES where one was seen, as `backward_kernels.adam`; moments of others
         stay.
         """
-        values, first, second, weight = (
-            part[: self.count] for part in (self._values, self._first, self._second, self._weight)
-        )
+        values = self._values[: self.count]
+        first = self._first[: self.count]
+        second = self._second[: self.count]
+        weight = self._weight[: self.count]
         # Masks that are multiplied with, not indexed by: the host need not know how many there are.
         blocks = torch.nn.functional.pad(seen, (0, -len(seen) % LANES)).view(-1, LANES)
         seen = blocks.any(1).repeat_interleave(LANES)[: len(seen)]
         seen = (seen & gradient.isfinite().all(1))[:, None]
         gradient = torch.where(seen, gradient, 0.0)
         share = seen.to(values.dtype)
-        weight.lerp_(torch.ones_like(weight), (1 - _BETAS[1]) * share[:, 0])
-        first.lerp_(gradient, (1 - _BETAS[0]) * share)
-        second.lerp_(gradient.square(), (1 - _BETAS[1]) * share)
+        weight.lerp_(torch.ones_like(weight), (1 - ADAM_DECAYS[1]) * share[:, 0])
+        first.lerp_(gradient, (1 - ADAM_DECAYS[0]) * share)
+        second.lerp_(gradient.square(), (1 - ADAM_DECAYS[1]) * share)
         size = (
-            second / weight[:, None].clamp_min(1 - _BETAS[1])
-        ).sqrt() + _EPS  # a weight is at least that where seen
+            second / weight[:, None].clamp_min(1 - ADAM_DECAYS[1])
+        ).sqrt() + ADAM_EPSILON  # a weight is at least that where seen
         values.sub_(torch.where(seen, rates * first / size, 0.0))
 
     @torch.no_grad()
@@ -462,10 +456,10 @@ def photometric_loss(
         # Wang et al. 2004, Eq. 13: S = a1 a2 / (b1 b2).
         square = ma.square() + mb.square()
         product = ma * mb
-        a1 = 2 * product + _C1
-        a2 = 2 * (qab - product) + _C2
-        b1 = square + _C1
-        b2 = qaa + qbb - square + _C2
+        a1 = 2 * product + SSIM_C1
+        a2 = 2 * (qab - product) + SSIM_C2
+        b1 = square + SSIM_C1
+        b2 = qaa + qbb - square + SSIM_C2
         scale = 1 / (b1 * b2)
         index = a1 * a2 * scale
         similar = index.mean()
@@ -480,7 +474,7 @@ def photometric_loss(
 def _windowed(images: Annotated[Tensor, "C H W"], padding: int) -> Annotated[Tensor, "C h w"]:
     """Means under SSIM's window where it lies inside, with so many zeros around the images."""
     at = torch.arange(WINDOW, dtype=images.dtype, device=images.device) - WINDOW // 2
-    weights = torch.softmax(-at.square() / (2 * _SIGMA**2), 0)
+    weights = torch.softmax(-at.square() / (2 * WINDOW_SIGMA**2), 0)
     many = len(images)
     # One window a channel: torch's own kernels for that never round to TF32, which would lose the variances.
     down, across = (weights.view(1, 1, *shape).expand(many, -1, -1, -1) for shape in ((-1, 1), (1, -1)))

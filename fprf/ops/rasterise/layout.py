@@ -13,17 +13,20 @@ import numpy as np
 
 from ..simd import LANES, load, maximum, splat, square_root
 from ..threads import cached_jit, on_threads, take
+from . import MAX_COORDINATE, MAX_LOG
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 FIXED = 11
 """Rows of a block before its harmonics."""
 BLOCKS = 64
-"""Blocks that a thread takes at a time."""
+"""Blocks that a thread takes at a time: 1024 Gaussians; by eye."""
 _f = np.float32
-_LARGE = _f(1e15)
-_MOST_LOG = _f(30)
+_COORDINATE_LIMIT = _f(MAX_COORDINATE)
+_LOG_LIMIT = _f(MAX_LOG)
 MARK = _f(-70)
-"""Coordinates beyond which a Gaussian is invalid; most of a logarithm; the logit of the invalid."""
+"""The logit of the invalid: far below any that is cut at -MAX_LOG."""
+MIN_SQUARED_NORM = 1e-24
+"""Squared length below which a vector is not made longer; above float32's smallest number."""
 
 jit = cached_jit(nogil=True, fastmath={"contract", "arcp", "nsz"})
 
@@ -44,11 +47,13 @@ def _pack(counters, means, quaternions, log_scales, logits, harmonics, blocks):
             if fine:
                 fine = logits[i] == logits[i]
                 for c in range(3):
-                    fine = fine and abs(means[i, c]) < _LARGE and log_scales[i, c] == log_scales[i, c]
+                    fine = (
+                        fine and abs(means[i, c]) < _COORDINATE_LIMIT and log_scales[i, c] == log_scales[i, c]
+                    )
                     for k in range(bands):
-                        fine = fine and abs(harmonics[i, k, c]) < _LARGE
+                        fine = fine and abs(harmonics[i, k, c]) < _COORDINATE_LIMIT
                 for c in range(4):
-                    fine = fine and abs(quaternions[i, c]) < _LARGE
+                    fine = fine and abs(quaternions[i, c]) < _COORDINATE_LIMIT
             if not fine:
                 for row in range(rows):
                     blocks[o + row * LANES] = _f(0)
@@ -56,10 +61,10 @@ def _pack(counters, means, quaternions, log_scales, logits, harmonics, blocks):
                 continue
             for c in range(3):
                 blocks[o + c * LANES] = means[i, c]
-                blocks[o + (3 + c) * LANES] = min(max(log_scales[i, c], -_MOST_LOG), _MOST_LOG)
+                blocks[o + (3 + c) * LANES] = min(max(log_scales[i, c], -_LOG_LIMIT), _LOG_LIMIT)
             for c in range(4):
                 blocks[o + (6 + c) * LANES] = quaternions[i, c]
-            blocks[o + 10 * LANES] = min(max(logits[i], -_MOST_LOG), _MOST_LOG)
+            blocks[o + 10 * LANES] = min(max(logits[i], -_LOG_LIMIT), _LOG_LIMIT)
             for k in range(bands):
                 for c in range(3):
                     blocks[o + (FIXED + 3 * k + c) * LANES] = harmonics[i, k, c]
@@ -80,7 +85,7 @@ def direction(mean, view):
     dx = mean[0] - view[16]
     dy = mean[1] - view[17]
     dz = mean[2] - view[18]
-    shrink = 1 / square_root(maximum(dx * dx + dy * dy + dz * dz, 1e-24))
+    shrink = 1 / square_root(maximum(dx * dx + dy * dy + dz * dz, MIN_SQUARED_NORM))
     return dx * shrink, dy * shrink, dz * shrink, shrink
 
 
@@ -116,16 +121,17 @@ def colour(blocks, at, basis):
     """0.5 + harmonics times the basis: three vectors, before they are cut at 0."""
     colours = [splat(basis[0], 0.5)] * 3
     for k, b in enumerate(basis):
-        colours = [
-            each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(colours)
-        ]
+        for c in range(3):
+            colours[c] = colours[c] + b * load(blocks, at + (FIXED + 3 * k + c) * LANES)
     return colours
 
 
-def direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
+def direction_slopes(direction, bands, blocks, at, of_colours):
     """The gradient of the colour in a unit direction, from that of its channels; components along the
     direction are left in.
     """
+    x, y, z = direction
+    red, green, blue = of_colours
     gx = gy = gz = splat(x, 0)
     c1 = 0.4886025119029199
     for k in range(1, bands):

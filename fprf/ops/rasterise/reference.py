@@ -17,12 +17,16 @@ import torch
 from torch import Tensor
 
 from ..harmonics import spherical_harmonics
-from . import BLUR, MAX_ALPHA, MIN_ALPHA
+from . import BLUR, MAX_ALPHA, MAX_COORDINATE, MAX_LOG, MAX_SQUARE_PIXELS, MIN_ALPHA, TANGENT_MARGIN
 
 TILE = 16
-_MOST_LOG = 30.0
-_HUGE = 1e16
-_LARGE = 1e15
+"""Pixels of a tile's side, as in the kernels."""
+_MIN_NORM = 1e-12
+"""Length below which a quaternion is not made longer; float32 squares it to 1e-24."""
+_SLOPE_EPSILON = 1e-8
+"""Added under the root of anti-aliasing, which then has a finite slope at 0."""
+_MIN_REACH = 1e-30
+"""Opacity over MIN_ALPHA below which its logarithm is no longer taken; above float32's smallest number."""
 
 
 class Pinhole(NamedTuple):
@@ -58,7 +62,7 @@ def view_colours(
     0.
     """
     pose = camera.world_to_camera.to(means)
-    fine = (means.abs() < _LARGE).all(-1) & (harmonics.abs() < _LARGE).flatten(1).all(-1)
+    fine = (means.abs() < MAX_COORDINATE).all(-1) & (harmonics.abs() < MAX_COORDINATE).flatten(1).all(-1)
     direction = torch.where(fine[:, None], means, torch.zeros_like(means)) + pose[:3, :3].T @ pose[:3, 3]
     harmonics = torch.where(fine[:, None, None], harmonics, torch.zeros_like(harmonics))
     basis = spherical_harmonics(
@@ -84,24 +88,26 @@ def project_reference(
     # What is not finite would spoil the gradients of all others: harmless numbers take its place, and it is
     # not drawn.
     shape = torch.cat([quaternions, log_scales, logits[:, None]], -1)
-    fine = (means.abs() < _LARGE).all(-1) & (quaternions.abs() < _LARGE).all(-1) & ~shape.isnan().any(-1)
-    means, quaternions = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (means, quaternions))
-    log_scales = torch.where(fine[:, None], log_scales, torch.zeros_like(log_scales)).clamp(
-        -_MOST_LOG, _MOST_LOG
+    fine = (
+        (means.abs() < MAX_COORDINATE).all(-1)
+        & (quaternions.abs() < MAX_COORDINATE).all(-1)
+        & ~shape.isnan().any(-1)
     )
-    logits = torch.where(fine, logits, torch.zeros_like(logits)).clamp(-_MOST_LOG, _MOST_LOG)
+    means, quaternions = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (means, quaternions))
+    log_scales = torch.where(fine[:, None], log_scales, torch.zeros_like(log_scales)).clamp(-MAX_LOG, MAX_LOG)
+    logits = torch.where(fine, logits, torch.zeros_like(logits)).clamp(-MAX_LOG, MAX_LOG)
     # Tangents of the means. Far outside the image J would explode: its tangents alone are limited, the means
     # are not.
     x, y, depth = (means @ world[:3, :3].T + world[:3, 3]).unbind(-1)
     z = torch.where(depth > camera.near, depth, torch.ones_like(depth))
     u = x / z
     v = y / z
-    beyond_u = 0.15 * camera.width / fx
-    beyond_v = 0.15 * camera.height / fy
+    beyond_u = TANGENT_MARGIN * camera.width / fx
+    beyond_v = TANGENT_MARGIN * camera.height / fy
     limited_u = u.clamp(-cx / fx - beyond_u, (camera.width - cx) / fx + beyond_u)
     limited_v = v.clamp(-cy / fy - beyond_v, (camera.height - cy) / fy + beyond_v)
     # Rows of J W R S: the half axes in pixels, whose products are the covariance.
-    qw, qx, qy, qz = torch.nn.functional.normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
+    qw, qx, qy, qz = torch.nn.functional.normalize(quaternions, dim=-1, eps=_MIN_NORM).unbind(-1)
     rows = [
         1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy),
         2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx),
@@ -110,7 +116,7 @@ def project_reference(
     axes = world[:3, :3] @ torch.stack(rows, -1).view(-1, 3, 3) * log_scales.exp()[:, None]
     across = (fx / z)[:, None] * (axes[:, 0] - limited_u[:, None] * axes[:, 2])
     down = (fy / z)[:, None] * (axes[:, 1] - limited_v[:, None] * axes[:, 2])
-    fine = fine & (across.square().sum(-1) + down.square().sum(-1) < _HUGE)
+    fine = fine & (across.square().sum(-1) + down.square().sum(-1) < MAX_SQUARE_PIXELS)
     across, down = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (across, down))
     xx = across.square().sum(-1)
     yy = down.square().sum(-1)
@@ -120,13 +126,11 @@ def project_reference(
     det_blurred = det_sharp + BLUR * (xx + yy) + BLUR**2
     opacity = torch.sigmoid(logits)
     if antialiased:
-        opacity = (
-            opacity * (det_sharp / det_blurred + 1e-8).sqrt()
-        )  # + 1e-8: the root has a finite slope at 0
+        opacity = opacity * (det_sharp / det_blurred + _SLOPE_EPSILON).sqrt()  # Mip-Splatting, Eq. 9
     covariance = torch.stack([xx + BLUR, xy, yy + BLUR], -1)
     mean = torch.stack([fx * u + cx, fy * v + cy], -1)
     # Where alpha falls to 1/255: x^T Sigma^-1 x = 2 ln(255 o).
-    reach = 2 * (opacity.detach() / MIN_ALPHA).clamp_min(1e-30).log()
+    reach = 2 * (opacity.detach() / MIN_ALPHA).clamp_min(_MIN_REACH).log()
     extent = (reach.clamp_min(0)[:, None] * covariance.detach()[:, ::2]).sqrt()
     seen = fine & (depth > camera.near) & (reach > 0)
     extent = torch.where(seen[:, None], extent, -torch.ones_like(extent))
@@ -155,16 +159,11 @@ def rasterise_reference(
     behind = torch.cat([background, background.new_zeros(1)])
     rows = []
     for top in range(0, camera.height, TILE):
-        tiles = [
-            _tile(
-                splats,
-                values,
-                behind,
-                (top, min(top + TILE, camera.height)),
-                (left, min(left + TILE, camera.width)),
-            )
-            for left in range(0, camera.width, TILE)
-        ]
+        vertical = (top, min(top + TILE, camera.height))
+        tiles = []
+        for left in range(0, camera.width, TILE):
+            horizontal = (left, min(left + TILE, camera.width))
+            tiles.append(_tile(splats, values, behind, vertical, horizontal))
         rows.append(torch.cat(tiles, 1))
     image = torch.cat(rows)
     return image[..., :-1], image[..., -1]

@@ -22,7 +22,7 @@ exponential errs by 1.1e-4 of alpha.
 # mypy: disable-error-code="call-arg, attr-defined"
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,12 +32,17 @@ from ...errors import FprfError
 from ..backend import compiled, compiled_for
 from .reference import Pinhole, rasterise_reference, view_colours
 
+if TYPE_CHECKING:
+    from .forward_kernels import Channels
+
 __all__ = ["Pinhole", "Rasterised", "lift", "rasterise"]
 
 _Array = np.ndarray[Any, Any]
 _SKIPPED = ("faint", "behind", "outside", "invalid")
 _WIDE = 8
 """Feature channels that the kernels composite at once."""
+_MIN_OPACITY = 1e-6
+"""Of a pixel, below which its depth is 0: a drawn alpha is at least 1/255."""
 
 
 class Rasterised(NamedTuple):
@@ -97,7 +102,7 @@ def rasterise(
         )
     # The mean depth by weight.
     opacity = 1 - passing
-    depth = planes[..., 3] / opacity.clamp_min(1e-6)  # a drawn alpha is at least 1/255
+    depth = planes[..., 3] / opacity.clamp_min(_MIN_OPACITY)
     return Rasterised(planes[..., :3], depth, opacity, planes[..., 4:], counts)
 
 
@@ -121,7 +126,8 @@ def lift(
         raise FprfError(
             f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones"
         )
-    pixels, channels = pixels.detach(), pixels.shape[-1]
+    channels = pixels.shape[-1]
+    pixels = pixels.detach()
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
     if not compiled_for(*shape, pixels):
         # Rendering is linear in the values, so their gradient for given pixels is its transpose.
@@ -188,15 +194,12 @@ class _Rasterise(torch.autograd.Function):
         of_features = np.empty((tiles.total, features.shape[1] + -features.shape[1] % _WIDE), np.float32)
         total = None
         begin = 0
-        for (channels, values, stride, first), (out, left) in zip(
-            _groups(ctx.view, features), ctx.made, strict=True
-        ):
-            slope = _planes(tiles, grad[..., begin : begin + channels], channels)
-            begin += channels
+        for channels, (out, left) in zip(_groups(ctx.view, features), ctx.made, strict=True):
+            slope = _planes(tiles, grad[..., begin : begin + channels.number], channels.number)
+            begin += channels.number
             sums = kernels.composite_back(
-                tiles, channels, values, stride, first,
-                out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1),
-            )  # fmt: skip
+                tiles, channels, out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1)
+            )
             if total is None:
                 total = sums
                 of_left = np.zeros_like(of_left)
@@ -204,7 +207,12 @@ class _Rasterise(torch.autograd.Function):
                 # Features move alphas as colours do; the last slot is spare.
                 total.reshape(-1, kernels.SUMS)[:-1, :6] += sums.reshape(-1, kernels.SUMS)[:-1, :6]
                 kernels.lift_values(
-                    tiles, sums, of_features.reshape(-1), of_features.shape[1], first, channels
+                    tiles,
+                    sums,
+                    of_features.reshape(-1),
+                    of_features.shape[1],
+                    channels.first,
+                    channels.number,
                 )
         # From sums over pixels to the parameters, in blocks; then a row a Gaussian.
         assert total is not None
@@ -297,12 +305,12 @@ def _view(
     return _View(tiles, blocks, bands, seen, counts)
 
 
-def _groups(view: _View, features: Tensor) -> list[tuple[int, _Array, int, int]]:
-    """Channels that are composited together: how many, the array that holds them, its stride and the first
-    one.
-
-    Colour and depth lie in the splats; features, in groups of 8, padded with zeros.
+def _groups(view: _View, features: Tensor) -> "list[Channels]":
+    """Channels that are composited together: colour and depth, which lie in the splats; then features, in
+    groups of 8, padded with zeros.
     """
+    from .forward_kernels import Channels
+
     padded = features.shape[1] + -features.shape[1] % _WIDE
     values = (
         torch.nn.functional.pad(features.detach(), (0, padded - features.shape[1]))
@@ -310,7 +318,10 @@ def _groups(view: _View, features: Tensor) -> list[tuple[int, _Array, int, int]]
         .view(-1)
         .numpy()
     )
-    return [(4, view.tiles.splats, 16, 6), *((_WIDE, values, padded, c) for c in range(0, padded, _WIDE))]
+    groups = [Channels(4, view.tiles.splats, 16, 6)]
+    for first in range(0, padded, _WIDE):
+        groups.append(Channels(_WIDE, values, padded, first))
+    return groups
 
 
 def _composite(
@@ -326,15 +337,13 @@ def _composite(
     tiles = view.tiles
     made: list[tuple[_Array, _Array]] = []
     saturated = 0
-    for channels, values, stride, first in _groups(view, features):
-        out = np.empty((channels, *_padded(tiles)), np.float32)
+    for channels in _groups(view, features):
+        out = np.empty((channels.number, *_padded(tiles)), np.float32)
         left = np.empty(_padded(tiles), np.float32)
-        behind = np.zeros(channels, np.float32)
+        behind = np.zeros(channels.number, np.float32)
         if not made:  # colour and depth come first; only colour has a background
             behind[:3] = background.detach().numpy()
-        saturated = kernels.composite(
-            tiles, channels, values, stride, first, behind, out.reshape(-1), left.reshape(-1)
-        )
+        saturated = kernels.composite(tiles, channels, behind, out.reshape(-1), left.reshape(-1))
         made.append((out, left))
     # Off with the margin of whole tiles and the padding of the last group; the arrays in `made` keep both for
     # gradients.

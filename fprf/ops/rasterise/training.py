@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from .. import photometric
 from ..simd import LANES, aligned
 from ..threads import sources
+from . import TANGENT_MARGIN
 from . import backward_kernels as backward
 from . import forward_kernels as forward
 from .forward_kernels import SIDE, SLOTS
@@ -34,12 +35,13 @@ if TYPE_CHECKING:  # it imports torch, which compilation need not wait for
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
-MEANS = slice(0, 3)
-LOG_SCALES = slice(3, 6)
-QUATERNION = slice(6, 10)
-LOGIT = slice(10, 11)
+# Columns of parameters: as rows lie in a block (`layout`).
+MEANS = slice(0, 3)  # world units
+LOG_SCALES = slice(3, 6)  # natural logarithms
+QUATERNION = slice(6, 10)  # w x y z
+LOGIT = slice(10, 11)  # of the opacity
 HARMONICS = slice(FIXED, None)
-_UNUSED = -20
+_UNUSED_LOGIT = -20
 """Logit of the opacity in rows that hold no Gaussian: they are never drawn."""
 
 
@@ -75,7 +77,9 @@ class Target(NamedTuple):
     ) -> "Target":
         """The same photograph, taken with other axes from another place."""
         camera = self.camera.copy()
-        camera[:9], camera[9:12], camera[16:19] = axes.reshape(-1), -axes @ centre, centre
+        camera[:9] = axes.reshape(-1)
+        camera[9:12] = -axes @ centre
+        camera[16:19] = centre
         return self._replace(camera=camera)
 
     @property
@@ -113,10 +117,10 @@ def camera_array(camera: "Pinhole", antialiased: bool) -> Floats:
     # J is taken at most 15 % of the image beyond its edges: further out the linear projection stretches
     # without bound.
     limits = [
-        -cx / fx - 0.15 * camera.width / fx,
-        (camera.width - cx) / fx + 0.15 * camera.width / fx,
-        -cy / fy - 0.15 * camera.height / fy,
-        (camera.height - cy) / fy + 0.15 * camera.height / fy,
+        -cx / fx - TANGENT_MARGIN * camera.width / fx,
+        (camera.width - cx) / fx + TANGENT_MARGIN * camera.width / fx,
+        -cy / fy - TANGENT_MARGIN * camera.height / fy,
+        (camera.height - cy) / fy + TANGENT_MARGIN * camera.height / fy,
     ]
     place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
     return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
@@ -177,10 +181,12 @@ class TrainableGaussians:
         for part, values in ((self._blocks, parameters), (self._first, first), (self._second, second)):
             part[:] = 0
             if part is self._blocks:  # rows without a Gaussian are never drawn, and are turned like nothing
-                self._by_block(part)[:, QUATERNION.start], self._by_block(part)[:, LOGIT] = 1, _UNUSED
+                self._by_block(part)[:, QUATERNION.start] = 1
+                self._by_block(part)[:, LOGIT] = _UNUSED_LOGIT
             if values is not None:
                 self._put(part, np.arange(self.count), values)
-        self._weight[:], self._weight[: self.count] = 0, weight
+        self._weight[:] = 0
+        self._weight[: self.count] = weight
 
     def read(
         self, columns: slice = slice(None), index: NDArray[np.int64] | None = None
@@ -227,11 +233,8 @@ class TrainableGaussians:
         """Sort all Gaussians: the i-th becomes what the order[i]-th was. Neighbours in space should be
         neighbours here.
         """
-        for part in (
-            self._blocks,
-            self._first,
-            self._second,
-        ):  # one after the other: a copy takes as much again
+        # One after the other: a copy takes as much again.
+        for part in (self._blocks, self._first, self._second):
             self._put(part, np.arange(self.count), self._read(part, index=order))
         self._weight[: self.count] = self._weight[order]
 
@@ -269,9 +272,8 @@ class TrainableGaussians:
             channels *= factors[:, None]
         # Pixels to sums for each entry (Gaussian in a tile), and these to parameters, which are moved at
         # once.
-        sums = backward.composite_back(
-            tiles, 3, self._splats, SLOTS, 6, out, left, slope, np.zeros_like(left)
-        )
+        colours = forward.Channels(3, self._splats, SLOTS, 6)
+        sums = backward.composite_back(tiles, colours, out, left, slope, np.zeros_like(left))
         moments = self._first, self._second, self._weight
         of_camera = backward.adam(tiles, self._blocks, moments, self.bands, camera, sums, rates)
         if valid is None:
@@ -299,7 +301,8 @@ class TrainableGaussians:
         # Three images to be carried back to the Gaussians, of the eight that the kernel takes at once.
         pixels = np.zeros(8 * area, np.float32)
         sums = np.empty((self.count, 8), np.float32)
-        pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
+        pixels[:area] = apart.reshape(3, area).sum(0)
+        pixels[2 * area : 3 * area] = 1
         if target.sky is not None:
             pixels[area : 2 * area] = target.sky
         backward.lift_values(tiles, backward.lift(tiles, 8, pixels), sums.reshape(-1), 8, 0, 8, skipped=0)
@@ -314,7 +317,8 @@ class TrainableGaussians:
         )  # fmt: skip
         out = np.zeros(len(target.planes), np.float32)
         left = np.empty(len(target.planes) // 3, np.float32)
-        forward.composite(tiles, 3, self._splats, SLOTS, 6, np.array(background, np.float32), out, left)
+        colours = forward.Channels(3, self._splats, SLOTS, 6)
+        forward.composite(tiles, colours, np.array(background, np.float32), out, left)
         return tiles, out, left
 
     def _by_block(self, part: Floats) -> Annotated[Floats, "B R L"]:
@@ -378,15 +382,16 @@ def _compile(bands: int, part: str) -> None:
     planes = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32)
     left = np.zeros(SIDE * SIDE, np.float32)
     blocks, first, second, splats = np.zeros((4, (FIXED + 3 * bands) * LANES), np.float32)
+    colours = forward.Channels(3, splats, SLOTS, 6)
     if part == "forward":
         tiles = forward.see(blocks, LANES, bands, camera, SIDE, SIDE, splats)
-        forward.composite(tiles, 3, splats, SLOTS, 6, camera[:3], planes, left)
+        forward.composite(tiles, colours, camera[:3], planes, left)
     else:
         slots = np.zeros(LANES + LANES + 1, np.int32)
         none = np.zeros(0, np.int32)
         tiles = forward.Tiles(splats, LANES, SIDE, SIDE, np.zeros(2, np.int32), none, none, none, slots, none)
         slope = photometric.loss(planes, planes, photometric.blurred(planes, SIDE, SIDE), SIDE, SIDE, 0.2)[2]
-        sums = backward.composite_back(tiles, 3, splats, SLOTS, 6, planes, left, slope, left)
+        sums = backward.composite_back(tiles, colours, planes, left, slope, left)
         backward.adam(
             tiles,
             blocks,
