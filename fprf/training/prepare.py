@@ -43,7 +43,7 @@ def planned(config: RunConfig, whole: ParsedScene | None = None) -> RunConfig:
     """
     if all(getattr(config, name) is not None for name in config.open):
         return config
-    return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.trained_on))
+    return config.planned(whole or read_scene(replace(config, downscale=1)), device_of(config.reading.device))
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
@@ -53,7 +53,7 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
     """
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    scene = parse_scene(config.data, config.downscale or 1, config.scene_parser)
+    scene = parse_scene(config.data, config.downscale or 1, config.reading.parser)
     if config.downscale is None and (size := planned(config, scene).downscale or 1) != 1:
         scene = replace(scene, cameras=scene.cameras.scaled(size))
     return scene if saved is None else at_origin(scene, saved.origin)
