@@ -66,8 +66,8 @@ def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
         if tuple(view_names(made.scene.paths)) != trained.known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
         for kind in ("content_encoder", "semantic_encoder"):
-            own = getattr(trained.known.facts, kind)
-            now = getattr(made.facts, kind)
+            own = getattr(trained.known.facts.of_field, kind)
+            now = getattr(made.facts.of_field, kind)
             if own != now:
                 raise WeightsError(
                     f"{kind.replace('_', ' ')}: the run was trained with {own}, this is {now}; train it again"

@@ -1,15 +1,14 @@
-"""The knob tree of a run. Imports no torch: help and parsing stay fast."""
+"""The config of a run of fields. Imports no torch: help and parsing stay fast."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 from .blocks.config import LayoutConfig, SingleConfig
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
-from .datamanagers.parsers.config import DataParserConfig
 from .errors import ConfigError, UsageError, WeightsError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
 from .plugins.config import Need
@@ -18,7 +17,7 @@ from .plugins.encoders.config import SEMANTICS, EncoderConfig, Vgg19Config
 from .plugins.executors.config import ExecutorConfig, SerialConfig
 from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
-from .run_config import RESUMABLE, RunConfig
+from .run_config import RESUMABLE, Reading, RunConfig
 
 if TYPE_CHECKING:
     import torch
@@ -209,10 +208,12 @@ class _Pace(NamedTuple):
     """Pixels of an image that are trained on however few rays there are."""
 
 
-_CPU = _Pace(rays=20e3, features=4.0, least=0.2e6)
-_ACCELERATOR = _Pace(rays=1e6, features=0.2, least=1e6)
+_CPU_PACE = _Pace(rays=20e3, features=4.0, least=0.2e6)
+"""Of two cores, by eye."""
+_ACCELERATOR_PACE = _Pace(rays=1e6, features=0.2, least=1e6)
+"""Of one GPU, by eye."""
 PASSES = 4
-"""Rays that larger images must leave for each of their pixels."""
+"""Rays that larger images must leave for each of their pixels; by eye."""
 _FEATURE_SHARE = 0.5
 """Share of a time limit that features may take before images are reduced below `least`, to a quarter of it at
 most.
@@ -297,28 +298,22 @@ class TrainConfig(RunConfig):
         return Blocks(self, scene, plan, prepared.facts, prepared.basis)
 
     @property
-    def trained_on(self) -> str:
-        return self.device
+    def reading(self) -> Reading:
+        return Reading(self.device, self.datamanager.parser, self.datamanager.masks)
 
-    @property
-    def scene_parser(self) -> DataParserConfig | None:
-        return self.datamanager.parser
-
-    @property
-    def masked(self) -> bool:
-        return self.datamanager.masks
-
-    def find_downscale(self, scene: "ParsedScene", device: str) -> int:
-        """Factor at which training sees each pixel often enough, and at which features take no more than
+    def planned(self, scene: "ParsedScene", device: "torch.device") -> "TrainConfig":
+        """At the size at which training sees each pixel often enough, and at which features take no more than
         their time.
 
         From the mean of the training images: the square root of their pixels over those wanted, rounded to a
         whole factor, so that images up to 2.25 times as large as wanted stay as they are.
         """
+        if self.downscale is not None:
+            return self
         sizes = scene.cameras.size[scene.train]
         if not len(sizes):
-            return 1
-        pace = _CPU if device == "cpu" else _ACCELERATOR
+            return replace(self, downscale=1)
+        pace = _CPU_PACE if device.type == "cpu" else _ACCELERATOR_PACE
         rays = float(self.steps * self.datamanager.batch_rays())
         if self.minutes is not None:
             rays = min(rays, 60 * self.minutes * pace.rays)
@@ -326,13 +321,14 @@ class TrainConfig(RunConfig):
         if self.minutes is not None:
             encoded = 1e6 * _FEATURE_SHARE * 60 * self.minutes / pace.features / len(sizes)
             wanted = min(wanted, max(encoded, pace.least / 4))
-        return max(1, round(math.sqrt(float(sizes.double().prod(1).mean()) / wanted)))
+        factor = round(math.sqrt(float(sizes.double().prod(1).mean()) / wanted))
+        return replace(self, downscale=max(1, factor))
 
     def changeable(self, before: RunConfig) -> tuple[str, ...]:
         """The same; blocks may be cut anew: those that the cut does not concern are kept."""
         former = getattr(before, "blocks", None)
         anew = self.blocks.cuts and isinstance(former, LayoutConfig) and former.cuts
-        return *(FREE_IN_BLOCKS if anew else RESUMABLE), *self.untrained
+        return FREE_IN_BLOCKS if anew else RESUMABLE
 
     def needs(self) -> list[Need]:
         """The same, and a decoder for the content encoder, whose weights are read where both could be

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from .checks import at_least, between, positive
 from .datamanagers.parsers.config import DataParserConfig
@@ -31,8 +31,19 @@ RESUMABLE = (
     "checkpoint_minutes",
 )
 """Fields of a run's config that may differ when a run is resumed."""
-_WHOLE_PIXELS = 640 * 360
-"""Of an image, where nobody says how far to reduce them and each step sees a whole one."""
+_MAX_IMAGE_PIXELS = 640 * 360
+"""Pixels of an image, at most, where nobody says how far to reduce them: each step sees a whole one; by eye."""
+
+
+class Reading(NamedTuple):
+    """How a run reads its capture, and where it is trained on."""
+
+    device: str = "cpu"
+    """cpu, cuda, mps or auto."""
+    parser: DataParserConfig | None = None
+    """Format of the scene folder; None = recognised from what lies in it."""
+    masks: bool = True
+    """Training and metrics leave out what the capture's masks name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +56,6 @@ class RunConfig:
 
     kind: ClassVar[str] = ""
     """Entry point in `fprf.scenes` of the function that opens such a run."""
-    untrained: ClassVar[tuple[str, ...]] = ()
-    """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on
-    them.
-    """
     open: ClassVar[tuple[str, ...]] = ("downscale",)
     """Fields whose value may be None, which `planned` decides before a run begins."""
 
@@ -104,41 +111,25 @@ class RunConfig:
         """
 
     @property
-    def trained_on(self) -> str:
-        """Device of the training: cpu, cuda, mps or auto."""
-        return "cpu"
-
-    @property
-    def scene_parser(self) -> DataParserConfig | None:
-        """Format of the scene folder; None = recognised from what lies in it."""
-        return None
-
-    @property
-    def masked(self) -> bool:
-        """True where training and metrics leave out what the capture's masks name."""
-        return True
+    def reading(self) -> Reading:
+        """How the capture is read, and where it is trained on."""
+        return Reading()
 
     def limited(self, views: int) -> int:
         """Optimiser steps on so many training views."""
         assert self.steps is not None
         return self.steps
 
-    def find_downscale(self, scene: "ParsedScene", device: str) -> int:
-        """Factor, at least 1, by which the images of a scene, at their own size, are reduced where none is
-        said.
-
-        `device` is a kind of device: cpu, cuda, mps. Here the smallest at which no image has more pixels than
-        640 x 360.
-        """
-        return max(1, math.ceil(math.sqrt(int(scene.cameras.size.prod(1).max()) / _WHOLE_PIXELS)))
-
     def planned(self, scene: "ParsedScene", device: "torch.device") -> "RunConfig":
         """The config with what it leaves open decided, from a scene at its own size and the device that will
         train.
+
+        Here images are reduced until none has more pixels than 640 x 360.
         """
         if self.downscale is not None:
             return self
-        return replace(self, downscale=self.find_downscale(scene, device.type))
+        largest = int(scene.cameras.size.prod(1).max())
+        return replace(self, downscale=max(1, math.ceil(math.sqrt(largest / _MAX_IMAGE_PIXELS))))
 
     def described(self) -> str:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""
@@ -146,7 +137,7 @@ class RunConfig:
 
     def changeable(self, before: "RunConfig") -> tuple[str, ...]:
         """Fields that may differ from those that a run was begun with when it goes on."""
-        return *RESUMABLE, *self.untrained
+        return RESUMABLE
 
     def needs(self) -> list[Need]:
         """Packages and weights that training needs and that are not here, each opened by the path of its

@@ -137,7 +137,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
                 shift = float(moves[view, 3:].norm())
                 poses[known.names[view]] = {"turn_degrees": math.degrees(turn), "shift": shift}
             fitted = {"fitted_poses": poses}
-        found = judge(scene, known, captured, views, display.count, save, masks=trained.masked)
+        found = judge(scene, known, captured, views, display.count, save, masks=trained.reading.masks)
         metrics = {
             "method": opened.method,
             "scene": known.name,

@@ -221,7 +221,9 @@ def picture_of(
         light = light_table[levels[top : top + _ROWS_AT_ONCE]]
         if space.high_dynamic_range and light.max() > KNEE_LIGHT:
             light = tone_mapped(light)
-        steps = ((light @ matrix).clip(0, 1) * np.float32(_SRGB_LEVELS - 1) + np.float32(0.5)).astype(np.uint16)
+        steps = ((light @ matrix).clip(0, 1) * np.float32(_SRGB_LEVELS - 1) + np.float32(0.5)).astype(
+            np.uint16
+        )
         picture[top : top + _ROWS_AT_ONCE] = signal_table[steps]
     return picture
 

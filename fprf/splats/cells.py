@@ -41,7 +41,7 @@ from ..training.prepare import device_of, read_scene
 from ..training.run import Run, known_of
 from ..training.tasks import WHOLE, Part, Task, digest_of, read_done, train_all
 from ..types import Cell
-from .config import GaussiansConfig
+from .config import UNTRAINED, GaussiansConfig
 from .gaussians import Gaussians, from_tensors, joined, tensors_of
 from .initial import curve_order
 from .learner import CPU, Bounds, GaussianLearner, Source, Stage, left_out, refined
@@ -276,7 +276,7 @@ def open_cell(task: Task) -> Overview | CellPart:
     assert isinstance(config, GaussiansConfig)  # by its kind
     scene = read_scene(replace(config, data=Path(task.data)), facts)
     # Fields of the config that may change without training a part anew.
-    free = (*RESUMABLE, *config.untrained, "cells")
+    free = (*RESUMABLE, *UNTRAINED, "cells")
     if number == WHOLE:
         own, every = overview_config(replace(config, data=Path(task.data)), scene)
         return Overview(

@@ -13,7 +13,7 @@ from ..errors import ConfigError
 from ..plugins.conversion import convert_fields
 from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
-from ..run_config import RunConfig
+from ..run_config import RESUMABLE, Reading, RunConfig
 
 if TYPE_CHECKING:
     import torch
@@ -30,6 +30,10 @@ _DEFAULT_STEPS = 10_000
 """Steps where neither they nor minutes are given; by eye."""
 _MAX_TIMED_STEPS = 100_000
 """Steps where minutes are given: more than there is time for."""
+
+
+UNTRAINED = ("semantic", "regions", "semantic_size", "executor")
+"""Fields of `GaussiansConfig` that nothing which is trained depends on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +82,6 @@ class GaussiansConfig(RunConfig):
     """3D Gaussians, trained from photographs."""
 
     kind: ClassVar[str] = "gaussians"
-    untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
     open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes")
 
     device: str = "auto"
@@ -236,16 +239,12 @@ class GaussiansConfig(RunConfig):
         return _MAX_TIMED_STEPS
 
     @property
-    def trained_on(self) -> str:
-        return self.device
+    def reading(self) -> Reading:
+        return Reading(self.device, self.parser, self.masks)
 
-    @property
-    def scene_parser(self) -> DataParserConfig | None:
-        return self.parser
-
-    @property
-    def masked(self) -> bool:
-        return self.masks
+    def changeable(self, before: RunConfig) -> tuple[str, ...]:
+        """The same, and all that nothing which is trained depends on."""
+        return *RESUMABLE, *UNTRAINED
 
     def limited(self, views: int) -> int:
         """At most so many passes over them."""

@@ -115,7 +115,7 @@ def assemble(
 ) -> Model:
     """A model whose points are routed to members."""
     sampler = BlockedSampler(config.sampler.build(seed=config.seed), members, router)
-    semantic = BlockedSemantic(members, router) if facts.dim else None
+    semantic = BlockedSemantic(members, router) if facts.of_field.dim else None
     return Model(Parts(facts.space, sampler, BlockedField(members, router), semantic, decoder), tones, poses)
 
 
@@ -123,12 +123,12 @@ def surroundings(config: TrainConfig, facts: Facts, cells: Sequence[Cell]) -> Bu
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at
     once.
     """
-    decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
+    decoder = build_decoder(config, encoder=facts.of_field.content_encoder, channels=facts.of_field.channels)
     member = Member(surroundings_of(cells), *build_fields(config, facts))
     tones = tones_of(facts)
     poses = poses_of(facts, config.poses)
     model = assemble(config, facts, ResidentMembers([member]), to_single, decoder, tones, poses)
-    check_parts(config, model.parts, facts.channels, facts.dim)
+    check_parts(config, model.parts, facts.of_field.channels, facts.of_field.dim)
     return Built(model, member)
 
 
@@ -354,10 +354,10 @@ def block_task(
         "space": [space.centre, space.rotation, space.scale, space.near, space.far],
         "views": views,
         "facts": [
-            facts.channels,
-            facts.dim,
-            facts.content_encoder,
-            facts.semantic_encoder,
+            facts.of_field.channels,
+            facts.of_field.dim,
+            facts.of_field.content_encoder,
+            facts.of_field.semantic_encoder,
             facts.background,
             facts.exposure,
         ],
@@ -409,7 +409,7 @@ class Block(Part):
             return pixel_mask(self.rays["seen"][slots[view]].bool(), (width, height))
 
         basis = None
-        if facts.dim:
+        if facts.of_field.dim:
             basis = Basis.from_tensors(self.run.load_tensors("basis"))
         prepared = prepare(config, scene, facts, space=facts.space, basis=basis, seen=seen)._replace(
             facts=facts

@@ -27,7 +27,7 @@ from ..style.dictionary import Reference, build_dictionary
 from ..style.look import Restyle, colour_maps
 from ..style.scene_style import scene_style
 from ..types import Want
-from .facts import Facts
+from .facts import Facts, FieldFacts
 from .model import Model, build_model
 from .views import render_view, view_rays
 
@@ -106,7 +106,8 @@ def _computed(device: torch.device) -> dict[str, Tensor]:
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
-    facts = Facts(space=space, channels=encoder.channels, dim=_DIM, content_encoder=encoder.identity)
+    of_field = FieldFacts(channels=encoder.channels, dim=_DIM, content_encoder=encoder.identity)
+    facts = Facts(space=space, field=of_field)
     model = build_model(config, facts).to(device)
     place = torch.tensor([(0.0, -0.4, 0.1)], dtype=torch.float64)
     target = torch.tensor([(0.1, 0.5, 0.0)], dtype=torch.float64)

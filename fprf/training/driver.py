@@ -99,7 +99,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     # What is missing is said before there is a folder.
     with Display(quiet=quiet) as display:
         _check_needs(config, method, display)
-        config.compile_kernels(device_of(config.trained_on), display.say)
+        config.compile_kernels(device_of(config.reading.device), display.say)
     start = time.perf_counter()  # of the minutes
     with lock_folder(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
@@ -114,13 +114,13 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
         scene = scene_at_size(config, whole, saved)
         for note in scene.notes:
             display.say(f"note: {note}")
-        if config.masked and (said := useless_masks(scene)):
+        if config.reading.masks and (said := useless_masks(scene)):
             display.say(said)
         hashes = image_hashes(scene)
         if run.exists and not changed_images:
             check_images(output, scene, hashes)
         # Reading photographs and extracting features takes minutes: nothing is written before it has worked.
-        learner = config.build(scene, device_of(config.trained_on), saved=saved, progress=display.count)
+        learner = config.build(scene, device_of(config.reading.device), saved=saved, progress=display.count)
         output.mkdir(parents=True, exist_ok=True)
         run.save_config(replace(config, output=None), method)  # the folder may be moved
         save_image_hashes(output, hashes)
@@ -390,7 +390,7 @@ def _check_needs(config: RunConfig, method: str, display: Display) -> None:
         needs.insert(
             0, Need("no scene is named", "give --data FOLDER, or --data garden for the embedded scene")
         )
-    elif config.scene_parser is None:
+    elif config.reading.parser is None:
         try:
             recognise(config.data)
         except DataError as fault:

@@ -207,11 +207,13 @@ class FieldLearner(SceneLearner):
         if self.prepared.basis is not None:
             run.save_tensors("basis", self.prepared.basis.tensors())
         facts = self.facts
-        if facts.dim:
-            semantics = f", {facts.dim} semantic"
+        of_field = facts.of_field
+        if of_field.dim:
+            semantics = f", {of_field.dim} semantic"
         else:
             semantics = ", no semantic"
-        return f", space {facts.space.kind}, {facts.channels} content{semantics} channels{', tones' * bool(facts.exposure)}"
+        tones = ", tones" if facts.exposure else ""
+        return f", space {facts.space.kind}, {of_field.channels} content{semantics} channels{tones}"
 
     def finish(self, run: Run, display: Display) -> None:
         finish(run, display, self.config, self.model, self.prepared.scene)

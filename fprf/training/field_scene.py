@@ -70,7 +70,7 @@ class Trained(Scene):
     @property
     def semantic_encoder(self) -> str:
         """Identity of the encoder that the run was trained with."""
-        return self.known.facts.semantic_encoder
+        return self.known.facts.of_field.semantic_encoder
 
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
         if resolution is None:
@@ -115,7 +115,7 @@ class Trained(Scene):
             reach = reach_of(captured, facts.space)
         for done, view in enumerate(views):
             progress(done, len(views), "fitting poses")
-            truth, where = self.known.photograph(captured, view, masks=self.config.masked)
+            truth, where = self.known.photograph(captured, view, masks=self.config.reading.masks)
             budget = self.config.render.budget
             moves[view] = fit_pose(
                 self.model, facts, self.cameras, view, truth, where, reach=reach, budget=budget
@@ -158,8 +158,8 @@ class Trained(Scene):
         content, semantic = build_encoders(config, semantic=basis is not None)
         # Features of another encoder would mean something else: references and scene must speak of the same.
         trained_with = (
-            ("content", content, facts.content_encoder),
-            ("semantic", semantic, facts.semantic_encoder),
+            ("content", content, facts.of_field.content_encoder),
+            ("semantic", semantic, facts.of_field.semantic_encoder),
         )
         for name, encoder, known in trained_with:
             if encoder is not None and encoder.identity != known:

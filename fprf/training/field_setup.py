@@ -15,7 +15,7 @@ from ..errors import WeightsError
 from ..interfaces import DataManager, Encoder
 from ..io.cache import cache_folder
 from ..rendering.space import Space
-from .facts import Facts
+from .facts import Facts, FieldFacts
 from .model import build_decoder
 from .prepare import device_of, exposure_of, facts_of
 
@@ -84,8 +84,7 @@ def prepare(
     # Scales are the spread of the targets: losses in their units weigh the same with any encoder.
     contents = manager.content_store
     semantics = manager.semantic_store
-    facts = replace(
-        facts,
+    of_field = FieldFacts(
         channels=content.channels,
         dim=0 if semantics is None else semantics.channels,
         content_encoder=content.identity,
@@ -93,4 +92,5 @@ def prepare(
         content_scale=1.0 if contents is None else contents.scale,
         semantic_scale=1.0 if semantics is None else semantics.scale,
     )
+    facts = replace(facts, field=of_field)
     return Prepared(scene, manager, facts, None if semantics is None else semantics.basis)

@@ -92,9 +92,9 @@ def terms(
     if rendered.rgb is not None and config.rgb > 0:
         result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
     if config.content > 0 and rendered.content is not None and batch.content is not None:
-        result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
+        result["content"] = F.mse_loss(rendered.content, batch.content) / facts.of_field.content_scale**2
     if config.semantic > 0 and rendered.semantic is not None and batch.semantic is not None:
-        result["semantic"] = F.l1_loss(rendered.semantic, batch.semantic) / facts.semantic_scale
+        result["semantic"] = F.l1_loss(rendered.semantic, batch.semantic) / facts.of_field.semantic_scale
     # Geometry: proposals bound the weights, weights gather (Mip-NeRF 360, Eq. 13 and 15), end at known
     # points, leave the sky.
     sampled = rendered.sampled

@@ -89,11 +89,12 @@ def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] 
 
 def build_fields(config: TrainConfig, facts: Facts) -> tuple[Sampler, ContentField, SemanticField | None]:
     """Sampler, content and semantic field at their seeded start."""
-    return (
-        config.sampler.build(seed=config.seed),
-        config.content.field.build(channels=facts.channels, seed=config.seed + 1),
-        config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None,
-    )
+    sampler = config.sampler.build(seed=config.seed)
+    content = config.content.field.build(channels=facts.of_field.channels, seed=config.seed + 1)
+    semantic = None
+    if facts.of_field.dim:
+        semantic = config.semantic.field.build(channels=facts.of_field.dim, seed=config.seed + 2)
+    return sampler, content, semantic
 
 
 def build_model(config: TrainConfig, facts: Facts) -> Model:
@@ -102,7 +103,8 @@ def build_model(config: TrainConfig, facts: Facts) -> Model:
     Raises WeightsError where no decoder fits the content encoder, PluginError where a part breaks its
     contract at once.
     """
-    decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
+    of_field = facts.of_field
+    decoder = build_decoder(config, encoder=of_field.content_encoder, channels=of_field.channels)
     parts = Parts(facts.space, *build_fields(config, facts), decoder)
-    check_parts(config, parts, facts.channels, facts.dim)
+    check_parts(config, parts, of_field.channels, of_field.dim)
     return Model(parts, tones_of(facts), poses_of(facts, config.poses))

@@ -43,7 +43,7 @@ def planned(config: RunConfig, whole: ParsedScene | None = None) -> RunConfig:
     """
     if all(getattr(config, name) is not None for name in config.open):
         return config
-    return config.planned(whole or read_whole_scene(config), device_of(config.trained_on))
+    return config.planned(whole or read_whole_scene(config), device_of(config.reading.device))
 
 
 def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
@@ -60,7 +60,7 @@ def read_whole_scene(config: RunConfig) -> ParsedScene:
     """The scene of a config at its own size. Raises as `read_scene`."""
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    return parse_scene(config.data, 1, config.scene_parser)
+    return parse_scene(config.data, 1, config.reading.parser)
 
 
 def scene_at_size(config: RunConfig, whole: ParsedScene, saved: Facts | None = None) -> ParsedScene:

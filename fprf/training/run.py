@@ -13,7 +13,6 @@ It can be moved and shared: it holds no absolute path that matters and needs nei
 render.
 """
 
-import dataclasses
 import json
 import os
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ from ..plugins.codec import from_json
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
 from ..run_config import RunConfig
-from .facts import Facts
+from .facts import Facts, facts_from_json, facts_to_json
 
 FORMAT = 1
 _SHOWN = 8
@@ -134,7 +133,7 @@ class Run:
         cameras = {}
         for key in _CAMERA:
             cameras[key] = getattr(scene.cameras, key).tolist()
-        document = {"format": FORMAT, **vars(known), "cameras": cameras, "facts": dataclasses.asdict(facts)}
+        document = {"format": FORMAT, **vars(known), "cameras": cameras, "facts": facts_to_json(facts)}
         write_json(self.root / "scene.json", document)
 
     def load_known(self) -> Known:
@@ -164,7 +163,7 @@ class Run:
                 cameras=Cameras(**cameras),
                 train=train,
                 test=test,
-                facts=from_json(document["facts"], Facts, path="facts"),
+                facts=facts_from_json(document["facts"]),
             )
 
     def saved_facts(self) -> Facts | None:

@@ -126,7 +126,7 @@ def test_a_part_that_breaks_its_contract_is_named(
 ) -> None:
     facts = world.prepared.facts
     parts = build_model(world.config, facts).parts
-    check_parts(world.config, parts, facts.channels, facts.dim)
+    check_parts(world.config, parts, facts.of_field.channels, facts.of_field.dim)
     module = getattr(parts, part)
     real = getattr(module, method)
     monkeypatch.setattr(
@@ -136,7 +136,7 @@ def test_a_part_that_breaks_its_contract_is_named(
     with pytest.raises(
         PluginError, match=rf"fprf\.{group}: '.*' \(fprf\..*from fprf .*\): .*{told}"
     ) as caught:
-        check_parts(world.config, parts, facts.channels, facts.dim)
+        check_parts(world.config, parts, facts.of_field.channels, facts.of_field.dim)
     assert "\n" not in str(caught.value)
 
 

@@ -48,7 +48,11 @@ def node() -> Path:
     """The folder with the packages."""
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("Node and npm are not installed: nothing to hold the files against")
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fprf-tests" / f"node-{SPLAT_TRANSFORM}"
+    cache = (
+        Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        / "fprf-tests"
+        / f"node-{SPLAT_TRANSFORM}"
+    )
     cache.mkdir(parents=True, exist_ok=True)
     if not (cache / "node_modules" / "three").is_dir():
         words = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(cache), *PACKAGES]

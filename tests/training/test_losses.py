@@ -54,10 +54,10 @@ def test_each_term_is_what_it_says(world: World) -> None:
     )
     assert float(found["rgb"]) == pytest.approx(float(rgb.square().mean()), rel=1e-5)
     assert float(found["content"]) == pytest.approx(
-        float(content.square().mean()) / facts.content_scale**2, rel=1e-5
+        float(content.square().mean()) / facts.of_field.content_scale**2, rel=1e-5
     )
     assert float(found["semantic"]) == pytest.approx(
-        float(semantic.abs().mean()) / facts.semantic_scale, rel=1e-5
+        float(semantic.abs().mean()) / facts.of_field.semantic_scale, rel=1e-5
     )
 
 

@@ -21,7 +21,9 @@ from fprf.training.run import Run
 
 def test_without_semantics(world: World) -> None:
     found = prepared_for(replace(world.config, semantic=replace(world.config.semantic, encoder=None)))
-    assert found.facts.dim == 0 and found.facts.semantic_encoder == "" and found.basis is None
+    assert (
+        found.facts.of_field.dim == 0 and found.facts.of_field.semantic_encoder == "" and found.basis is None
+    )
     assert found.manager.batch(0).semantic is None
 
 
@@ -57,7 +59,9 @@ def test_the_start_is_a_function_of_the_seed(world: World) -> None:
 def factor(width: int, height: int, views: int, minutes: float | None = None, device: str = "cpu") -> int:
     size = torch.tensor([[width, height]] * views)
     scene = SimpleNamespace(cameras=SimpleNamespace(size=size), train=torch.arange(views))
-    return replace(fprf_lite(), minutes=minutes).find_downscale(scene, device)  # type: ignore[arg-type]
+    planned = replace(fprf_lite(), minutes=minutes).planned(scene, torch.device(device))  # type: ignore[arg-type]
+    assert isinstance(planned.downscale, int)
+    return planned.downscale
 
 
 def test_photographs_are_reduced_as_far_as_docs_say() -> None:

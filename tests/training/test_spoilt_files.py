@@ -30,7 +30,7 @@ from fprf.splats.cells import Cells, load_cells
 from fprf.splats.config import GaussiansConfig
 from fprf.training import blocks, checkpoint
 from fprf.training.blocks import load_blocks, load_finished
-from fprf.training.facts import Facts
+from fprf.training.facts import Facts, FieldFacts
 from fprf.training.field_learner import training_summary
 from fprf.training.history import read_history
 from fprf.training.image_hashes import check_images, image_hashes, save_image_hashes
@@ -117,8 +117,8 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Example:
     run = Run(root)
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     facts = Facts(
-        space=Space("box", (0.0, 0.0, 0.0), axes, 1.0, 0.1, 9.0), channels=4, dim=2, content_encoder="a", semantic_encoder="b",
-        content_scale=1.0, semantic_scale=1.0, background=(0.0, 0.5, 1.0), exposure=(0.1,) * 4, centres=axes,
+        space=Space("box", (0.0, 0.0, 0.0), axes, 1.0, 0.1, 9.0), background=(0.0, 0.5, 1.0), exposure=(0.1,) * 4,
+        centres=axes, field=FieldFacts(channels=4, dim=2, content_encoder="a", semantic_encoder="b"),
     )  # fmt: skip
     save_config(root / "config.json", fprf_lite(), "fprf-lite")
     run.save_known(scene, town, facts)

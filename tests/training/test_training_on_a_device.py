@@ -260,7 +260,10 @@ def test_features_are_made_on_the_device(
     assert seen.uploads["aten._to_copy.default"] > 2 * len(there.scene.train), "each image, to each encoder"
     here = world.prepared.manager.batch(0)
     batch = there.manager.batch(0)
-    for kind, scale in (("content", there.facts.content_scale), ("semantic", there.facts.semantic_scale)):
+    for kind, scale in (
+        ("content", there.facts.of_field.content_scale),
+        ("semantic", there.facts.of_field.semantic_scale),
+    ):
         assert (getattr(batch, kind) - getattr(here, kind)).abs().max() <= 1e-3 * scale
 
 

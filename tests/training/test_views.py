@@ -76,7 +76,7 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     cached = trained.cached(trained.cameras, 1)
     assert torch.equal(cached.restyled().rgb, trained.render(trained.cameras, 1).rgb)
     assert sum(part.rays for part in cached.chunks) == 32 * 24
-    per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
+    per_sample = 4 * (1 + 48 + trained.known.facts.of_field.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.chunks)
     assert (
         kept * per_sample <= sum(part.bytes for part in cached.chunks) <= kept * per_sample + 16 * 32 * 24 + 8

@@ -125,7 +125,7 @@ class RegionConfig(StylizerConfig):
     """
     smoothness: float = 0.0
     """Likeness of the styles of regions that meet without an edge of colour between them, at least 0; 0 =
-    each by itself. A run from before this was measured is left as it is.
+    each by itself. It has no effect on runs of versions that did not measure which regions meet.
     """
     gain: float = 8.0
     """Largest amplification of any channel or direction, at least 1, so that the noise of flat regions stays
@@ -183,5 +183,5 @@ class RegionToneConfig(RegionConfig):
     """
     smoothness: float = 16.0
     """Likeness of the styles of regions that meet without an edge of colour between them, at least 0; 0 =
-    each by itself. A run from before this was measured is left as it is.
+    each by itself. It has no effect on runs of versions that did not measure which regions meet.
     """
