@@ -48,7 +48,7 @@ def seen_along(gaussians: Gaussians, direction: torch.Tensor) -> torch.Tensor:
 def test_a_glb_of_more_than_its_lengths_can_say_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fprf.splats.files.gltf._MOST", 1000)
+    monkeypatch.setattr("fprf.splats.files.gltf._MAX_BUFFER_BYTES", 1000)
     with pytest.raises(DataError, match=r"\.ply or \.spz"):
         write_gaussians(tmp_path / "x.glb", ball(40))
 

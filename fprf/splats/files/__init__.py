@@ -3,7 +3,7 @@
 """
 
 import mmap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -20,7 +20,7 @@ from ..activation import activated as with_activated
 from ..activation import file_harmonics, find_activation
 from ..drawing import seen_means
 from ..gaussians import GaussianRows, Gaussians, bulk_of
-from .base import Bools, Capture, Data, Floats, format_of, pieces, release
+from .base import Bools, Capture, CaptureFormat, Data, Floats, format_of, pieces, release
 
 __all__ = ["Capture", "Written", "read_capture", "release", "write_capture", "write_gaussians"]
 
@@ -44,7 +44,9 @@ class Written(NamedTuple):
 
     def losses(self) -> list[str]:
         """What was left out but Gaussians that cannot be drawn, and what is limited, each as a phrase."""
-        return [*([f"{self.far} far from the others left out"] if self.far else []), *self.notes]
+        if self.far:
+            return [f"{self.far} far from the others left out", *self.notes]
+        return list(self.notes)
 
 
 def read_capture(path: Path, *, activated: bool = False) -> Capture:
@@ -159,8 +161,6 @@ def write_gaussians(
     memory; they say themselves whether they are `antialiased`.
     """
     form = format_of(path)
-    faulty = False
-    far = 0
     added, beside = added_and_beside(origin, local or not form.exact)
     if isinstance(gaussians, GaussianRows):
         if form.exact and form.view_dependent and not plain:
@@ -169,28 +169,12 @@ def write_gaussians(
             return Written()
         antialiased = gaussians.antialiased
         gaussians = gaussians.part(slice(0, gaussians.count))
-    # What the format cannot hold is left out first, so that it decides nothing about the rest.
-    if not form.exact:
-        finite = gaussians.finite
-        faulty = not bool(finite.all())
-        gaussians = gaussians.select(finite) if faulty else gaussians
-        kept = form.keeps(gaussians)
-        far = 0 if kept is None else int((~kept).sum())
-        if far:
-            gaussians = gaussians.select(torch.from_numpy(kept))
-        else:
-            gaussians = gaussians
-        if far and not len(gaussians):
-            raise DataError(
-                f"{path}: all Gaussians lie too far from the origin for this format; write a .ply"
-            )
+    held = _held(path, form, gaussians)
+    gaussians = held.gaussians
     # Renderers that know less are given what views show of colours and opacities.
     bare = not form.view_dependent
-    if (
-        views is not None
-        and len(views)
-        and ((bare and gaussians.degree) or (antialiased and (bare or plain)))
-    ):
+    asks_views = (bare and gaussians.degree > 0) or (antialiased and (bare or plain))
+    if views is not None and len(views) and asks_views:
         seen = seen_means(gaussians, views, antialiased=antialiased)
         if bare:
             gaussians = seen.gaussians(gaussians)
@@ -200,7 +184,35 @@ def write_gaussians(
     # The offset comes last, so that a file that cannot be written leaves the one before it in its place.
     form.write(path, form.pack(gaussians, antialiased, added))
     write_offset(path, beside)
-    return Written(faulty, far, tuple(form.notes(gaussians)))
+    return Written(held.faulty, held.far, tuple(form.notes(gaussians)))
+
+
+class _Held(NamedTuple):
+    """What a format holds of Gaussians."""
+
+    gaussians: Gaussians
+    faulty: bool
+    """Some cannot be drawn, and are left out."""
+    far: int
+    """Outliers that are left out."""
+
+
+def _held(path: Path, form: CaptureFormat, gaussians: Gaussians) -> _Held:
+    """The Gaussians that a format holds: the others are left out first, so that they decide nothing about the
+    rest. Raises DataError where none is left.
+    """
+    if form.exact:
+        return _Held(gaussians, False, 0)
+    finite = gaussians.finite
+    faulty = not bool(finite.all())
+    if faulty:
+        gaussians = gaussians.select(finite)
+    kept = form.keeps(gaussians)
+    if kept is None or bool(kept.all()):
+        return _Held(gaussians, faulty, 0)
+    if not kept.any():
+        raise DataError(f"{path}: all Gaussians lie too far from the origin for this format; write a .ply")
+    return _Held(gaussians.select(torch.from_numpy(kept)), faulty, int((~kept).sum()))
 
 
 def write_capture(
@@ -224,19 +236,25 @@ def write_capture(
             path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin
         )
         return written._replace(faulty=not bool(finite.all()))
-    changed = torch.cat([
-        (harmonics[rows] != before[rows]).flatten(1).any(1) & harmonics[rows].isfinite().flatten(1).all(1)
-        for rows in pieces(len(before))
-    ])  # fmt: skip
+    changed = _changed(before, harmonics)
     if bool(changed.any()):
         form.write(path, capture.recolour(harmonics.numpy(), np.asarray(changed)))
     else:
-        form.write(
-            path,
-            (
-                capture.data[start : start + _MIN_MAPPED_BYTES]
-                for start in range(0, len(capture.data), _MIN_MAPPED_BYTES)
-            ),
-        )
+        form.write(path, _in_pieces(capture.data))
     write_offset(path, capture.offset)
     return Written()
+
+
+def _changed(before: Annotated[Tensor, "N K 3"], after: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N"]:
+    """Which Gaussians have other harmonics that are finite; some rows at a time, to save memory."""
+    found = []
+    for rows in pieces(len(before)):
+        other = (after[rows] != before[rows]).flatten(1).any(1)
+        found.append(other & after[rows].isfinite().flatten(1).all(1))
+    return torch.cat(found)
+
+
+def _in_pieces(data: Data) -> Iterator[bytes]:
+    """A file as it is."""
+    for start in range(0, len(data), _MIN_MAPPED_BYTES):
+        yield data[start : start + _MIN_MAPPED_BYTES]

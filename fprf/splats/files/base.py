@@ -43,15 +43,17 @@ small.
 """
 UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
 """Errors that a document raises, as it is taken apart, that is no valid index of a format."""
-_EDGE = 1e-6
+_MIN_OPACITY_MARGIN = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
-_MOST = 64.0
-"""Largest magnitude of harmonics and ln-scales that are written: far beyond what is seen, and no number
-spoils the others.
-"""
-_APART = 4.0
-"""Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it."""
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_MAX_MAGNITUDE = 64.0
+"""Of harmonics and ln-scales that are written: far beyond what is seen, and no number spoils the others."""
+_MIN_OUTLIER_DISTANCE = 4.0
+"""Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it (by eye)."""
+_MAX_ROUNDING_OF_TURNS = 1e-9
+"""Of numbers that are solved for, from whole ones: turns by right angles and mirrorings are whole, exactly."""
+_ORDER_CELLS = 1024
+"""Along a side of the grid of spatial order: what a Morton code of 30 bits holds."""
+_OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Of the four components of a quaternion those that are stored, by the one that is not."""
 
 
@@ -208,10 +210,9 @@ def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[
     """
     if not any(origin):
         return table
-    kinds = {
-        name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()
-    }
-    out = table.astype([*kinds.items()])
+    kinds: list[tuple[str, Any]] = [(name, table.dtype[name]) for name in table.dtype.names or ()]
+    in_float64 = [(name, "<f8" if name in ("x", "y", "z") else kind) for name, kind in kinds]
+    out = table.astype(in_float64)
     for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
         out[name] = column + of
     return out
@@ -238,10 +239,13 @@ def release(data: Data) -> None:
 
 def arrays(gaussians: Gaussians) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Means [N 3], quaternions [N 4], ln-scales [N 3], logits [N] and harmonics [N K 3]."""
-    means, turns, scales, logits, harmonics = (
-        part.detach().cpu().numpy() for part in vars(gaussians).values()
+    return (
+        gaussians.means.detach().cpu().numpy(),
+        gaussians.quaternions.detach().cpu().numpy(),
+        gaussians.log_scales.detach().cpu().numpy(),
+        gaussians.logits.detach().cpu().numpy(),
+        gaussians.harmonics.detach().cpu().numpy(),
     )
-    return means, turns, scales, logits, harmonics
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:
@@ -281,7 +285,7 @@ def shares(values: Floats, low: Floats, high: Floats) -> Floats:
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1.0), 0.0)
 
 
-def finite(values: Floats, most: float = _MOST) -> NDArray[np.float64]:
+def finite(values: Floats, most: float = _MAX_MAGNITUDE) -> NDArray[np.float64]:
     """Numbers in float64, 0 for NaN, limited to a magnitude."""
     return np.clip(np.nan_to_num(values.astype(np.float64)), -most, most)
 
@@ -293,7 +297,7 @@ def sigmoid(x: Floats) -> Floats:
 
 def logit(opacity: Floats) -> Floats:
     """The inverse of the sigmoid, finite."""
-    inside = np.clip(opacity.astype(np.float64), _EDGE, 1 - _EDGE)
+    inside = np.clip(opacity.astype(np.float64), _MIN_OPACITY_MARGIN, 1 - _MIN_OPACITY_MARGIN)
     return np.log(inside / (1 - inside))
 
 
@@ -324,7 +328,7 @@ def smallest_three(quaternions: Floats) -> tuple[NDArray[np.int64], Floats]:
     rows = np.arange(len(unit))
     # q and -q are one rotation: the component that is left out is made positive.
     unit = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
-    return largest, unit[rows[:, None], _OTHERS[largest]] * 2**0.5
+    return largest, unit[rows[:, None], _OTHER_COMPONENTS[largest]] * 2**0.5
 
 
 def three_to_four(largest: NDArray[np.int64], three: Floats) -> Floats:
@@ -332,7 +336,7 @@ def three_to_four(largest: NDArray[np.int64], three: Floats) -> Floats:
     rows = np.arange(len(three))
     others = three / 2**0.5
     out = np.empty((len(three), 4))
-    out[rows[:, None], _OTHERS[largest]] = others
+    out[rows[:, None], _OTHER_COMPONENTS[largest]] = others
     out[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(1)))
     return out
 
@@ -352,7 +356,7 @@ def turned_harmonics(rotation: Floats, bands: int) -> Floats:
         spherical_harmonics(there, degree), spherical_harmonics(before, degree)
     ).solution
     whole = matrix.round()  # turns by right angles and mirrorings are whole numbers, exactly
-    return np.asarray(torch.where((matrix - whole).abs() < 1e-9, whole, matrix))
+    return np.asarray(torch.where((matrix - whole).abs() < _MAX_ROUNDING_OF_TURNS, whole, matrix))
 
 
 def levels_of(means: Floats) -> NDArray[np.int64]:
@@ -360,7 +364,7 @@ def levels_of(means: Floats) -> NDArray[np.int64]:
     level = np.zeros(len(means), np.int64)
     rest = np.arange(len(means))
     # What is far from the bulk of the rest may have a bulk of its own, and so on.
-    while len(rest := rest[bulk_of(means[rest]).apart > _APART]):
+    while len(rest := rest[bulk_of(means[rest]).apart > _MIN_OUTLIER_DISTANCE]):
         level[rest] += 1
     return level
 
@@ -377,8 +381,9 @@ def spatial_order(means: Floats) -> NDArray[np.int64]:
         points = means[at].astype(np.float64)
         low = points.min(0)
         high = points.max(0)
-        cells = ((points - low) / np.maximum(high - low, np.finfo(np.float32).tiny) * 1023).astype(np.int64)
-        order.append(at[morton_order(cells)])
+        span = np.maximum(high - low, np.finfo(np.float32).tiny)
+        cells = (points - low) / span * (_ORDER_CELLS - 1)
+        order.append(at[morton_order(cells.astype(np.int64))])
     return np.concatenate(order) if order else level
 
 
@@ -396,6 +401,8 @@ def precise(means: Floats, step: Callable[[Floats, Floats], float], share: float
     tried = [np.inf, *(2.0**k for k in range(14, -1, -1))]
     wanted = max(share * bulk.side, step(means[bulk.apart <= tried[-1]], inner))
     # The widest reach that is precise enough: the last one is by the definition of `wanted`.
-    return next(
-        kept for kept in (bulk.apart <= reach for reach in tried) if step(means[kept], inner) <= wanted
-    )
+    for reach in tried:
+        kept = bulk.apart <= reach
+        if step(means[kept], inner) <= wanted:
+            break
+    return kept

@@ -13,8 +13,9 @@ import json
 import math
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -32,16 +33,28 @@ from ..gaussians import COUNTS, Gaussians
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 
-_NAME = "KHR_gaussian_splatting"
-_HARMONICS = [f"{_NAME}:SH_DEGREE_{degree}_COEF_{k}" for degree in range(4) for k in range(2 * degree + 1)]
-_SHAPE = ("POSITION", f"{_NAME}:ROTATION", f"{_NAME}:SCALE", f"{_NAME}:OPACITY")
-_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_MOST = (1 << 32) - (1 << 20)
+_EXTENSION_NAME = "KHR_gaussian_splatting"
+_POSITION = "POSITION"
+_ROTATION = f"{_EXTENSION_NAME}:ROTATION"
+_SCALE_ATTRIBUTE = f"{_EXTENSION_NAME}:SCALE"
+_OPACITY = f"{_EXTENSION_NAME}:OPACITY"
+_SHAPE_WIDTHS = {_POSITION: 3, _ROTATION: 4, _SCALE_ATTRIBUTE: 3, _OPACITY: 1}
+"""Attributes of every primitive of Gaussians, and the numbers of each."""
+_COMPONENT_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+"""Types by their numbers in glTF, which are OpenGL's."""
+_FLOAT = 5126
+_BYTE = 5121
+_WIDTH_OF_TYPE = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_TYPE_OF_WIDTH = {width: name for name, width in _WIDTH_OF_TYPE.items()}
+_LN_SIZE_LIMITS = (-80.0, 80.0)
+"""ln-scales that are written: their sizes are finite in float32, and not 0."""
+_MAX_NODE_SHEAR = 1e-3
+"""Of a node's matrix from a turn and one scale: float32 and rounded text are closer."""
+_MAX_BUFFER_BYTES = (1 << 32) - (1 << 20)
 """Bytes of a .glb's buffer, whose lengths are 32-bit; the rest is for its document."""
-_LEAST = 1e-30
+_MIN_SIZE_OF_GLTF = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
-_DRAFTS = ("BT.", "Display-P3", "linear")
+_DRAFT_COLOUR_SPACES = ("BT.", "Display-P3", "linear")
 """Beginnings of colour-space names of drafts before the review draft, when SCALE was a logarithm; later texts
 share theirs.
 """
@@ -72,7 +85,7 @@ class _Part(NamedTuple):
 
     def sizes(self, rows: slice | NDArray[np.int64]) -> Floats:
         """SCALE of some rows, as it stands in the file."""
-        column = self.columns[_SHAPE[2]][rows]
+        column = self.columns[_SCALE_ATTRIBUTE][rows]
         if self.whole:
             return column.astype(np.float64)
         return _values(column)
@@ -82,23 +95,41 @@ class _Part(NamedTuple):
         sizes.
         """
         # Attributes may be whole numbers that stand for shares, except of harmonics.
-        points, turns, opacity = (_values(self.columns[name][rows]) for name in (*_SHAPE[:2], _SHAPE[3]))
+        points = _values(self.columns[_POSITION][rows])
+        turns = _values(self.columns[_ROTATION][rows])
+        opacity = _values(self.columns[_OPACITY][rows])
         scale = self.sizes(rows)
+        if not logarithmic:
+            scale = np.log(np.maximum(scale, _MIN_SIZE_OF_GLTF))
         # The quaternion product of the node's rotation and the Gaussians' own.
         a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
         product = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
         harmonics = np.stack([_values(self.columns[name][rows]) for name in names], 1)
         if self.linear:
             harmonics = _in_other_light(harmonics, to_linear=False)
-        else:
-            harmonics = harmonics
         return (
             self.scale * points @ self.rotation.T + self.translation,
             np.roll(turns, 1, 1) @ product.T,
-            (scale if logarithmic else np.log(np.maximum(scale, _LEAST))) + np.log(self.scale),
+            scale + np.log(self.scale),
             base.logit(opacity[:, 0]),
             np.matmul(base.turned_harmonics(self.rotation, len(names)), harmonics),
         )
+
+    def recolour(self, names: list[str], harmonics: Floats, changed: Bools) -> None:
+        """Overwrite columns of colours, and what programs without the extension show, of rows that
+        changed.
+        """
+        back = base.turned_harmonics(self.rotation, len(names)).T
+        for rows in base.pieces(len(self.columns[_POSITION])):
+            which = changed[rows]
+            new = np.matmul(back, base.finite(harmonics[rows]))
+            if self.linear:
+                new = _in_other_light(new, to_linear=True)
+            for name, column in zip(names, new.transpose(1, 0, 2), strict=True):
+                self.columns[name][rows][which] = column[which]
+            plain = self.columns.get("COLOR_0")
+            if plain is not None and plain.dtype == np.uint8:
+                plain[rows, :3][which] = base.steps(base.colours_of(new), 255)[which]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,110 +143,84 @@ class Gltf(CaptureFormat):
         """All primitives of Gaussians of the file's scene. Raises DataError where there is none."""
         try:
             # Both kinds are handled as a .glb: a .gltf is packed into one first.
-            if data[:4] == b"glTF":
-                data = data
-            else:
+            if data[:4] != b"glTF":
                 data = _binary(path, json.loads(bytes(data)))
             document, start = _document(data)
             parts = _parts(path, document, data, start)
-            names = [name for name in _HARMONICS if parts and name in parts[0].columns]
-            if any({*names} ^ {name for name in part.columns if ":SH_" in name} for part in parts) or len(
-                names
-            ) not in (
-                0,
-                *COUNTS,
-            ):
-                raise ValueError("harmonics of degrees that are not whole, or differ")
+            names = _colours_of_all(parts)
         except base.UNSOUND as error:
             raise DataError(
                 f"{path}: no sound glTF ({error!r}); copy it again, it is damaged or of another kind"
             ) from error
         if not parts:
-            raise DataError(f"{path}: a glTF without {_NAME} in its scene; it holds no 3D Gaussians")
+            raise DataError(
+                f"{path}: a glTF without {_EXTENSION_NAME} in its scene; it holds no 3D Gaussians"
+            )
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
             # The document stays byte for byte; columns of colours are overwritten in a copy of the buffer.
             out = bytearray(data)
             begin = 0
             for part in _parts(path, document, out, start):
-                back = base.turned_harmonics(part.rotation, len(names)).T
-                for rows in base.pieces(len(part.columns["POSITION"])):
-                    here = slice(begin + rows.start, begin + rows.stop)
-                    which = changed[here]
-                    new = np.matmul(back, base.finite(harmonics[here]))
-                    if part.linear:
-                        new = _in_other_light(new, to_linear=True)
-                    else:
-                        new = new
-                    for name, column in zip(names, new.transpose(1, 0, 2), strict=True):
-                        part.columns[name][rows][which] = column[which]
-                    colour = part.columns.get("COLOR_0")
-                    if (
-                        colour is not None and colour.dtype == np.uint8
-                    ):  # what programs without the extension show
-                        colour[rows, :3][which] = base.steps(base.colours_of(new), 255)[which]
-                begin += len(part.columns["POSITION"])
+                end = begin + len(part.columns[_POSITION])
+                part.recolour(names, harmonics[begin:end], changed[begin:end])
+                begin = end
             return [bytes(out)]
 
-        # One section a primitive: each has its own node, and so its own axes.
         logarithmic, reason = _logarithmic(document, parts)
-        sections = [
-            (len(part.columns["POSITION"]), lambda rows, part=part: part.decoded(rows, names, logarithmic))
-            for part in parts
-        ]
+        # One section a primitive: each has its own node, and so its own axes.
+        sections = []
+        for part in parts:
+            decode = partial(part.decoded, names=names, logarithmic=logarithmic)
+            sections.append((len(part.columns[_POSITION]), decode))
         gaussians, shift = base.decoded(len(names), *sections)
+        kind = "linear, as in the final text"
         if logarithmic:
             kind = "logarithms, as in the review draft"
-        else:
-            kind = "linear, as in the final text"
         compensated = parts[0].extension.get("extras") == {"antialiased": True}
-        notes = (f"sizes are {kind} of {_NAME}: {reason}",)
+        notes = (f"sizes are {kind} of {_EXTENSION_NAME}: {reason}",)
         return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=notes)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A .glb of one node; harmonics of degree 4 are left out."""
-        means, turns, scales, logits, harmonics = base.arrays(gaussians)
-        opacity = base.sigmoid(logits)[:, None]
-        # Columns lie one after the other in the buffer; quaternions have w last.
-        shape = (means, np.roll(base.unit_quaternions(turns), -1, 1), np.exp(scales.clip(-80, 80)), opacity)
-        columns: dict[str, Floats] = dict(
-            zip((*_SHAPE, *_HARMONICS), (*shape, *harmonics.transpose(1, 0, 2)), strict=False)
-        )
-        columns = {name: values.astype("<f4") for name, values in columns.items()}
-        columns["COLOR_0"] = base.steps(np.concatenate([base.colours_of(harmonics), opacity], 1), 255).astype(
-            np.uint8
-        )
+        columns = _written_columns(gaussians)
         # Each column has a view of the buffer and an accessor of that view.
         views = []
-        accessors = []
+        accessors: list[dict[str, Any]] = []
         size = 0
-        for k, values in enumerate(columns.values()):
-            kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
-            code = 5126 if values.dtype == "<f4" else 5121
+        for number, values in enumerate(columns.values()):
             views.append({"buffer": 0, "byteOffset": size, "byteLength": values.nbytes, "target": 34962})
-            accessors.append({"bufferView": k, "componentType": code, "count": len(values), "type": kind})
+            accessors.append({
+                "bufferView": number,
+                "componentType": _FLOAT if values.dtype == "<f4" else _BYTE,
+                "count": len(values),
+                "type": _TYPE_OF_WIDTH[values.shape[1]],
+            })  # fmt: skip
             size += values.nbytes
         # The specification demands the bounds of positions; bytes of colours stand for shares.
+        means = columns[_POSITION]
         accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
         accessors[-1]["normalized"] = True
         extension: dict[str, Any] = {
             "kernel": "ellipse",
             "colorSpace": "srgb_rec709_display",
             "projection": "perspective",
+            "sortingMethod": "cameraDistance",
         }
-        extension |= {"sortingMethod": "cameraDistance"} | (
-            {"extras": {"antialiased": True}} if antialiased else {}
-        )
-        attributes = {name: k for k, name in enumerate(columns)}
+        if antialiased:
+            extension["extras"] = {"antialiased": True}
+        primitive = {
+            "attributes": {name: number for number, name in enumerate(columns)},
+            "mode": 0,
+            "extensions": {_EXTENSION_NAME: extension},
+        }
         document = {
             "asset": {"version": "2.0", "generator": "fprf"},
-            "extensionsUsed": [_NAME],
+            "extensionsUsed": [_EXTENSION_NAME],
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": [{"mesh": 0, "rotation": [1, 0, 0, 0]}],
-            "meshes": [
-                {"primitives": [{"attributes": attributes, "mode": 0, "extensions": {_NAME: extension}}]}
-            ],
+            "meshes": [{"primitives": [primitive]}],
             "accessors": accessors,
             "bufferViews": views,
             "buffers": [{"byteLength": size}],
@@ -233,11 +238,37 @@ class Gltf(CaptureFormat):
         super().write(path, pieces)
 
 
+def _colour_attributes() -> list[str]:
+    """Names of the attributes of harmonics, in order."""
+    names = []
+    for degree in range(4):
+        for number in range(2 * degree + 1):
+            names.append(f"{_EXTENSION_NAME}:SH_DEGREE_{degree}_COEF_{number}")
+    return names
+
+
+def _written_columns(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
+    """The attributes of a file, in the order of its buffer; quaternions have w last."""
+    means, turns, scales, logits, harmonics = base.arrays(gaussians)
+    opacity = base.sigmoid(logits)[:, None]
+    columns: dict[str, NDArray[Any]] = {
+        _POSITION: means,
+        _ROTATION: np.roll(base.unit_quaternions(turns), -1, 1),
+        _SCALE_ATTRIBUTE: np.exp(scales.clip(*_LN_SIZE_LIMITS)),
+        _OPACITY: opacity,
+    }
+    columns |= zip(_colour_attributes(), harmonics.transpose(1, 0, 2), strict=False)
+    columns = {name: values.astype("<f4") for name, values in columns.items()}
+    colours = np.concatenate([base.colours_of(harmonics), opacity], 1)
+    columns["COLOR_0"] = base.steps(colours, 255).astype(np.uint8)
+    return columns
+
+
 def _glb(document: dict[str, Any], body: Iterable[bytes]) -> list[bytes]:
     """The pieces of a .glb: its header, its document and its one buffer."""
-    if (needed := document["buffers"][0]["byteLength"]) > _MOST:
+    if (needed := document["buffers"][0]["byteLength"]) > _MAX_BUFFER_BYTES:
         raise DataError(
-            f"Gaussians of {needed} bytes, where a .glb holds {_MOST} at most; export them as .ply or .spz"
+            f"Gaussians of {needed} bytes, where a .glb holds {_MAX_BUFFER_BYTES} at most; export them as .ply or .spz"
         )
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
     chunks = [*body]
@@ -282,8 +313,30 @@ def _binary(path: Path, document: dict[str, Any]) -> bytes:
 
 def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: int) -> list[_Part]:
     """The primitives of Gaussians that nodes of the scene show; `data` has the buffer from `start` on."""
+    found = []
+    for node, matrix in _shown_nodes(document):
+        if "mesh" not in node:
+            continue
+        for primitive in document["meshes"][node["mesh"]]["primitives"]:
+            if _EXTENSION_NAME in primitive.get("extensions", {}):
+                columns = {}
+                for name, at in primitive["attributes"].items():
+                    columns[name] = _column(document, data, start, at)
+                found.append(_part(path, document, primitive, columns, matrix))
+    # Gaussians shown several times would multiply a small file, and have but one place for several new
+    # colours.
+    colours = [part.columns[_colour_attributes()[0]] for part in found]
+    colours.sort(key=lambda column: column.ctypes.data)
+    if any(itertools.starmap(np.may_share_memory, itertools.pairwise(colours))):
+        raise DataError(
+            f"{path}: several nodes or primitives show the same Gaussians; export each with its own"
+        )
+    return found
+
+
+def _shown_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Floats]]:
+    """Nodes of the scene, each with the matrix [4 4] from its frame to right down front."""
     nodes = document.get("nodes", [])
-    found = list[_Part]()
     seen = set[int]()
     scene = document.get("scenes", [{"nodes": range(len(nodes))}])[document.get("scene", 0)]
     # From right up back, in which a scene is, to right down front.
@@ -293,81 +346,91 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
             raise ValueError(f"node {index} is reached twice")
         seen.add(index)
         node = nodes[index]
-        # The node's own matrix, from its parent's frame, or its parts.
-        if "matrix" in node:
-            local = np.array(node["matrix"], np.float64).reshape(4, 4).T
-        else:
-            local = np.eye(4)
-            (x, y, z, w) = node.get("rotation", (0, 0, 0, 1))
-            turn = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
-            local[:3, :3] = turn * node.get("scale", (1, 1, 1))
-            local[:3, 3] = node.get("translation", (0, 0, 0))
-        matrix = above @ local
+        matrix = above @ _matrix_of(node)
         waiting += [(child, matrix) for child in node.get("children", [])]
-        for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
-            extension = primitive.get("extensions", {}).get(_NAME)
-            if extension is None:
-                continue
-            if extension.get("extensions"):
-                raise DataError(
-                    f"{path}: Gaussians packed by {', '.join(extension['extensions'])}; export them uncompressed"
-                )
-            columns = {}
-            for name, at in primitive["attributes"].items():
-                columns[name] = _column(document, data, start, at)
-            widths = {}
-            for name in columns:
-                if name in _SHAPE or name in _HARMONICS:
-                    widths[name] = columns[name].shape[1]
-            wanted = dict.fromkeys(_HARMONICS, 3) | dict(zip(_SHAPE, (3, 4, 3, 1), strict=True))
-            sound = {*_SHAPE, _HARMONICS[0]} <= {*columns} and all(
-                wanted[name] == width for name, width in widths.items()
-            )
-            if not sound or len({len(column) for column in columns.values()}) > 1:
-                raise DataError(
-                    f"{path}: Gaussians without one of {', '.join(_SHAPE)}, or of unequal shapes; export it again"
-                )
-            # Gaussians stay Gaussians of the same kind under turns, shifts and one scale for all axes.
-            linear = matrix[:3, :3]
-            scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-            if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < 1e-3:
-                raise DataError(
-                    f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first"
-                )
-            about = document["accessors"][primitive["attributes"][_SHAPE[2]]]
-            whole = about["componentType"] != 5126 and not about.get("normalized")
-            found.append(_Part(columns, linear / scale, scale, matrix[:3, 3], extension, whole))
-    # Gaussians shown several times would multiply a small file, and have but one place for several new
-    # colours.
-    colours = sorted((part.columns[_HARMONICS[0]] for part in found), key=lambda column: column.ctypes.data)
-    if any(itertools.starmap(np.may_share_memory, itertools.pairwise(colours))):
+        yield node, matrix
+
+
+def _matrix_of(node: dict[str, Any]) -> Floats:
+    """The matrix [4 4] from a node's frame to its parent's, or that of its parts."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    local = np.eye(4)
+    (x, y, z, w) = node.get("rotation", (0, 0, 0, 1))
+    turn = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+    local[:3, :3] = turn * node.get("scale", (1, 1, 1))
+    local[:3, 3] = node.get("translation", (0, 0, 0))
+    return local
+
+
+def _part(
+    path: Path,
+    document: dict[str, Any],
+    primitive: dict[str, Any],
+    columns: dict[str, NDArray[Any]],
+    matrix: Floats,
+) -> _Part:
+    """A primitive of Gaussians in a frame. Raises DataError where it is none that can be read."""
+    extension = primitive["extensions"][_EXTENSION_NAME]
+    if extension.get("extensions"):
+        packed = ", ".join(extension["extensions"])
+        raise DataError(f"{path}: Gaussians packed by {packed}; export them uncompressed")
+    harmonics = _colour_attributes()
+    wanted = dict.fromkeys(harmonics, 3) | _SHAPE_WIDTHS
+    needed = {*_SHAPE_WIDTHS, harmonics[0]}
+    sound = needed <= {*columns} and len({len(column) for column in columns.values()}) == 1
+    for name, column in columns.items():
+        sound = sound and column.shape[1] == wanted.get(name, column.shape[1])
+    if not sound:
         raise DataError(
-            f"{path}: several nodes or primitives show the same Gaussians; export each with its own"
+            f"{path}: Gaussians without one of {', '.join(_SHAPE_WIDTHS)}, or of unequal shapes; export it again"
         )
-    return found
+    # Gaussians stay Gaussians of the same kind under turns, shifts and one scale for all axes.
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not scale > 0 or not np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() < _MAX_NODE_SHEAR:
+        raise DataError(
+            f"{path}: a node shears, mirrors or stretches its Gaussians; apply its transform first"
+        )
+    about = document["accessors"][primitive["attributes"][_SCALE_ATTRIBUTE]]
+    whole = about["componentType"] != _FLOAT and not about.get("normalized")
+    return _Part(columns, linear / scale, scale, matrix[:3, 3], extension, whole)
+
+
+def _colours_of_all(parts: list[_Part]) -> list[str]:
+    """Attributes of harmonics, which all primitives have, of whole degrees. Raises ValueError for others."""
+    if not parts:
+        return []
+    names = [name for name in _colour_attributes() if name in parts[0].columns]
+    alike = len(names) in COUNTS
+    for part in parts:
+        alike = alike and {*names} == {name for name in part.columns if ":SH_" in name}
+    if not alike:
+        raise ValueError("harmonics of degrees that are not whole, or differ")
+    return names
 
 
 def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, str]:
     """True where SCALE holds logarithms of sizes, for all of a file's Gaussians, and the reason in words."""
     # A size is never negative; its logarithm is where anything is smaller than the unit.
     for part in parts:
-        if any(bool((part.sizes(rows) < 0).any()) for rows in base.pieces(len(part.columns["POSITION"]))):
-            return True, "some are negative"
+        for rows in base.pieces(len(part.columns[_POSITION])):
+            if bool((part.sizes(rows) < 0).any()):
+                return True, "some are negative"
     # What wrote the file may be known, or the draft that it follows.
     generator = str(document["asset"].get("generator"))
     version = re.match(r"splat-transform (\d+)\.(\d+)", generator)
-    if version or generator == "fprf":
-        return version is not None and (
-            int(version[1]),
-            int(version[2]),
-        ) < _LINEAR_SINCE, f"{generator[:40]} wrote it"
+    if version:
+        return (int(version[1]), int(version[2])) < _LINEAR_SINCE, f"{generator[:40]} wrote it"
+    if generator == "fprf":
+        return False, "fprf wrote it"
     for part in parts:
-        if str(part.extension.get("colorSpace")).startswith(_DRAFTS):
+        if str(part.extension.get("colorSpace")).startswith(_DRAFT_COLOUR_SPACES):
             return True, f"colorSpace {part.extension['colorSpace']} is that of a draft"
     # Else sizes are held against the distances between neighbours: Gaussians that cover a surface are about
     # as wide.
-    part = max(parts, key=lambda part: len(part.columns["POSITION"]))
-    points = part.columns["POSITION"]
+    part = max(parts, key=lambda part: len(part.columns[_POSITION]))
+    points = part.columns[_POSITION]
     spacing = nearest_distance(torch.from_numpy(_values(points)))
     some = np.linspace(0, len(points) - 1, _ASKED_SIZES).astype(np.int64)
     middle = np.sort(part.sizes(some), 1)[:, 1]
@@ -375,7 +438,7 @@ def _logarithmic(document: dict[str, Any], parts: list[_Part]) -> tuple[bool, st
     if spacing is None or not len(middle):
         return False, "nothing tells otherwise"
     number = float(np.median(middle))
-    ratios = (math.log(max(number, _LEAST)) - math.log(spacing), number - math.log(spacing))
+    ratios = (math.log(max(number, _MIN_SIZE_OF_GLTF)) - math.log(spacing), number - math.log(spacing))
     logarithmic = abs(ratios[1] - TYPICAL_LN_SIZE) < abs(ratios[0] - TYPICAL_LN_SIZE)
     shares = []
     for ratio in (ratios[logarithmic], ratios[not logarithmic]):
@@ -387,8 +450,8 @@ def _column(document: dict[str, Any], data: Data | bytearray, start: int, index:
     """The rows of an accessor, in the file's own memory; NumPy holds them against its size."""
     about = document["accessors"][index]
     view = document["bufferViews"][about["bufferView"]]
-    kind = np.dtype(_COMPONENTS[about["componentType"]])
-    width = _WIDTHS[about["type"]]
+    kind = np.dtype(_COMPONENT_TYPES[about["componentType"]])
+    width = _WIDTH_OF_TYPE[about["type"]]
     count = about["count"]
     stride = view.get("byteStride") or kind.itemsize * width
     offset = view.get("byteOffset", 0) + about.get("byteOffset", 0)

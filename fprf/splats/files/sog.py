@@ -36,22 +36,35 @@ from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _Bytes: TypeAlias = NDArray[np.uint8]
-_LEVELS = 256
-_ROW = 64
+_CODEBOOK_NUMBERS = 256
+"""Numbers of a codebook: what a byte tells apart."""
+_ENTRIES_PER_ROW = 64
 """Entries of the palette a row."""
-_PALETTE = 1 << 16
-_DENSE = 8
+_MAX_PALETTE_ENTRIES = 1 << 16
+"""Entries of a palette at most: what a label of 16 bits tells apart."""
+_MAX_PIXELS_PER_BYTE = 8
 """Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is
 decoded.
 """
-_SLACK = 1 << 16
-_PRECISION = 2.0**-12
+_SLACK_PIXELS = 1 << 16
+"""Pixels or Gaussians that any image may have, whatever its bytes: small ones shrink more."""
+_MAX_STEP_OF_SOG = 2.0**-12
 """Steps of positions in extents of the capture, to which outliers do not matter."""
-_MEMBERS = 64
-_NAME = re.compile(r"\w[\w .-]*\.(webp|png)", re.IGNORECASE)
+_MAX_MEMBERS = 64
+"""Files of an archive or names in a meta.json, at most; SOG has 8."""
+_IMAGE_NAME = re.compile(r"\w[\w .-]*\.(webp|png)", re.IGNORECASE)
 """Names of images in a folder: no other file can be read or replaced by what a meta.json says."""
-_LLOYD = 12
-_FIRST = (1980, 1, 1, 0, 0, 0)
+_CODEBOOK_STEPS = 12
+"""Steps of Lloyd's algorithm: further ones change no byte that is seen (by eye)."""
+_POSITION_STEPS = 65535
+"""Of positions between their bounds: 16 bits."""
+_MAX_LN_POSITION = 80.0
+"""Of positions that are read, as logarithms: beyond, no float32 holds them."""
+_LN_SIZES_OF_SOG = (-20.0, 20.0)
+"""ln-scales that are written: what lies beyond would spoil the codebook of the others."""
+_TURN_TAG = 252
+"""Added to the number of the component of a rotation that is left out, in its alpha."""
+_ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of archived files: the same capture gives the same bytes."""
 
 
@@ -70,79 +83,27 @@ class Sog(CaptureFormat):
             data = bundle(_folder(path, bytes(data)))
         files = unbundle(path, data)
         folder = folder_of(path, files)
-        parts = {
-            name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)
-        }
-        meta = _json(path, parts["meta.json"])
-        # Version 1 has no such entry.
-        version = meta.get("version", 1)
-        if version not in (1, 2):
-            raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
-        flat = meta.get("model") == "2dgs"
-        pictures = _Pictures(path, parts, meta)
-        count = pictures.count
-        low = pictures.rows("means", 0)[:, :3]
-        high = pictures.rows("means", 1)[:, :3]
-        least = pictures.numbers("means", "mins", 3)
-        most = pictures.numbers("means", "maxs", 3)
-        turn = pictures.rows("quats", 0)
-        scale = pictures.rows("scales", 0)
-        tint = pictures.rows("sh0", 0)
-        labels, rest = pictures.palette()
-
-        def part(rows: slice) -> tuple[Floats, ...]:
-            # Positions are 16 bits of a logarithm, low bytes in one image and high bytes in the other.
-            bent = least + (high[rows].astype(np.int64) << 8 | low[rows]) / 65535 * (most - least)
-            tag = turn[rows, 3].astype(np.int64) - 252
-            quaternions = base.three_to_four(np.clip(tag, 0, 3), turn[rows, :3] / 255 * 2 - 1)
-            quaternions[tag < 0] = (1, 0, 0, 0)
-            scales = pictures.decoded("scales", scale[rows, :3], 3)
-            if flat:
-                scales[:, 2] = -np.inf
-            # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
-            if version == 2:
-                constants = pictures.decoded("sh0", tint[rows, :3], 3)
-                logits = base.logit(tint[rows, 3] / 255)
-            else:
-                constants, logits = np.split(pictures.decoded("sh0", tint[rows], 4), [3], 1)
-            if len(rest):
-                harmonics = np.concatenate([constants[:, None], rest[labels[rows]]], 1)
-            else:
-                harmonics = constants[:, None]
-            means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80))
-            return means, quaternions, scales, logits.reshape(-1), harmonics
+        parts = {}
+        for name, content in files.items():
+            if name.startswith(folder):
+                parts[name.removeprefix(folder)] = content
+        rows = _Rows(path, parts)
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
-            # Constants are quantised anew, with a codebook or a range of their own.
-            new = {}
-            said = json.loads(parts["meta.json"])
-            name = said["sh0"]["files"][0]
-            index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
-            picture = pictures.picture(name)
-            picture.reshape(-1, 4)[:count, :3] = index
-            new[name] = _webp(picture)
-            if len(rest):
-                # Labels stay: an entry of the palette becomes the mean of what its Gaussians became.
-                mixed = _means(harmonics[:, 1:].reshape(count, -1), labels, len(rest)).reshape(rest.shape)
-                seen = np.bincount(labels, minlength=len(rest)) > 0
-                name = said["shN"]["files"][0]
-                index, said["shN"] = _quantized(np.where(seen[:, None, None], mixed, rest), said["shN"])
-                new[name] = _webp(_palette_picture(index))
-            new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
-            return [bundle(files | {folder + name: content for name, content in new.items()}, like=data)]
+            new = {folder + name: content for name, content in rows.recoloured(harmonics).items()}
+            return [bundle(files | new, like=data)]
 
-        antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-        gaussians, shift = base.decoded(1 + rest.shape[1], (count, part))
-        return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
+        gaussians, shift = base.decoded(rows.bands, (rows.count, rows.decoded))
+        return Capture(path, gaussians, rows.antialiased, data, recolour, shift=shift)
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """All but outliers that would cost the others their 16 bits."""
 
         def step(kept: Floats, inner: Floats) -> float:
             ends = [_bent(kept.min(0)), _bent(kept.max(0))]
-            return float(((ends[1] - ends[0]) / 65535 * (1 + np.abs(inner).max(0))).max())
+            return float(((ends[1] - ends[0]) / _POSITION_STEPS * (1 + np.abs(inner).max(0))).max())
 
-        return base.precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
+        return base.precise(gaussians.means.numpy().astype(np.float64), step, _MAX_STEP_OF_SOG)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
@@ -155,48 +116,30 @@ class Sog(CaptureFormat):
         bent = _bent(means.astype(np.float64))
         least = bent.min(0)
         most = bent.max(0)
-        at = base.steps(base.shares(bent, least, most), 65535)
+        at = base.steps(base.shares(bent, least, most), _POSITION_STEPS)
         # Rotations and opacities take 8 bits a number; sizes and constants share codebooks of 256.
         largest, three = base.smallest_three(turns)
+        turn = np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + _TURN_TAG], 1)
         opacity = base.steps(base.sigmoid(logits), 255)
-        scale, scales = _quantized(log_scales.clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
+        ln_sizes = log_scales.clip(*_LN_SIZES_OF_SOG)
+        scale, scales = _quantized(ln_sizes, {"files": ["scales.webp"], "codebook": []})
         tint, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
         pictures = {
             "means_l.webp": _picture(at & 255, shape),
             "means_u.webp": _picture(at >> 8, shape),
-            "quats.webp": _picture(
-                np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape
-            ),
+            "quats.webp": _picture(turn, shape),
             "scales.webp": _picture(scale, shape),
             "sh0.webp": _picture(np.concatenate([tint, opacity[:, None]], 1), shape),
         }
-        meta: dict[str, Any] = {
-            "version": 2,
-            "count": count,
-            **({"antialias": True, "model": "antialiased"} if antialiased else {}),
-            "means": {
-                "mins": least.tolist(),
-                "maxs": most.tolist(),
-                "files": ["means_l.webp", "means_u.webp"],
-            },
-            "scales": scales,
-            "quats": {"files": ["quats.webp"]},
-            "sh0": sh0,
-        }
+        bounds = {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]}
+        meta: dict[str, Any] = {"version": 2, "count": count}
+        if antialiased:
+            meta |= {"antialias": True, "model": "antialiased"}
+        meta |= {"means": bounds, "scales": scales, "quats": {"files": ["quats.webp"]}, "sh0": sh0}
         if gaussians.degree > 0:
-            # Whole rows of harmonics share a palette, whose entries share a codebook.
-            labels = _labels(harmonics[:, 1:].reshape(count, -1))
-            used = int(labels.max()) + 1
-            entries = _means(harmonics[:, 1:].reshape(count, -1), labels, used).reshape(used, -1, 3)
-            files = ["shN_centroids.webp", "shN_labels.webp"]
-            index, meta["shN"] = _quantized(
-                entries, {"count": used, "bands": gaussians.degree, "codebook": [], "files": files}
-            )
-            pictures[files[0]] = _palette_picture(index)
-            pictures[files[1]] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
-        parts = {}
-        for name, picture in pictures.items():
-            parts[name] = _webp(picture)
+            palette, meta["shN"] = _packed_palette(harmonics, gaussians.degree, shape)
+            pictures |= palette
+        parts = {name: _webp(picture) for name, picture in pictures.items()}
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
@@ -219,6 +162,95 @@ class Sog(CaptureFormat):
             path.with_name("meta.json").unlink(missing_ok=True)
 
 
+class _Rows:
+    """The Gaussians of a file, of which some rows at a time are decoded."""
+
+    def __init__(self, path: Path, parts: Mapping[str, bytes]) -> None:
+        self.parts = parts
+        meta = _json(path, parts["meta.json"])
+        # Version 1 has no such entry.
+        version = meta.get("version", 1)
+        if version not in (1, 2):
+            raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
+        pictures = _Pictures(path, parts, meta)
+        self.version = version
+        self.flat = meta.get("model") == "2dgs"
+        self.antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
+        self.pictures = pictures
+        self.count = pictures.count
+        self.low = pictures.rows("means", 0)[:, :3]
+        self.high = pictures.rows("means", 1)[:, :3]
+        self.least = pictures.numbers("means", "mins", 3)
+        self.most = pictures.numbers("means", "maxs", 3)
+        self.turn = pictures.rows("quats", 0)
+        self.scale = pictures.rows("scales", 0)
+        self.tint = pictures.rows("sh0", 0)
+        self.labels, self.rest = pictures.palette()
+        self.bands = 1 + self.rest.shape[1]
+
+    def decoded(self, rows: slice) -> tuple[Floats, ...]:
+        """Some of them as `base.decoded` wants them."""
+        # Positions are 16 bits of a logarithm, low bytes in one image and high bytes in the other.
+        steps = self.high[rows].astype(np.int64) << 8 | self.low[rows]
+        bent = self.least + steps / _POSITION_STEPS * (self.most - self.least)
+        means = np.sign(bent) * np.expm1(np.minimum(np.abs(bent), _MAX_LN_POSITION))
+        tag = self.turn[rows, 3].astype(np.int64) - _TURN_TAG
+        quaternions = base.three_to_four(np.clip(tag, 0, 3), self.turn[rows, :3] / 255 * 2 - 1)
+        quaternions[tag < 0] = (1, 0, 0, 0)
+        scales = self.pictures.decoded("scales", self.scale[rows, :3], 3)
+        if self.flat:
+            scales[:, 2] = -np.inf
+        # The alpha of sh0: opacities as they are, or, in version 1, logits of a range of their own.
+        if self.version == 2:
+            constants = self.pictures.decoded("sh0", self.tint[rows, :3], 3)
+            logits = base.logit(self.tint[rows, 3] / 255)
+        else:
+            constants, logits = np.split(self.pictures.decoded("sh0", self.tint[rows], 4), [3], 1)
+        harmonics = constants[:, None]
+        if len(self.rest):
+            harmonics = np.concatenate([harmonics, self.rest[self.labels[rows]]], 1)
+        return means, quaternions, scales, logits.reshape(-1), harmonics
+
+    def recoloured(self, harmonics: Floats) -> dict[str, bytes]:
+        """The files that change with other harmonics: constants are quantised anew, with a codebook or a range
+        of their own.
+        """
+        new = {}
+        said = json.loads(self.parts["meta.json"])
+        name = said["sh0"]["files"][0]
+        index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
+        picture = self.pictures.picture(name)
+        picture.reshape(-1, 4)[: self.count, :3] = index
+        new[name] = _webp(picture)
+        if len(self.rest):
+            # Labels stay: an entry of the palette becomes the mean of what its Gaussians became.
+            entries = len(self.rest)
+            mixed = _means(harmonics[:, 1:].reshape(self.count, -1), self.labels, entries)
+            seen = np.bincount(self.labels, minlength=entries) > 0
+            palette = np.where(seen[:, None, None], mixed.reshape(self.rest.shape), self.rest)
+            name = said["shN"]["files"][0]
+            index, said["shN"] = _quantized(palette, said["shN"])
+            new[name] = _webp(_palette_picture(index))
+        new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
+        return new
+
+
+def _packed_palette(
+    harmonics: Floats, degree: int, shape: tuple[int, int]
+) -> tuple[dict[str, _Bytes], dict[str, Any]]:
+    """The images of all harmonics but the constants, and what meta.json says of them: whole rows share a
+    palette, whose entries share a codebook.
+    """
+    rows = harmonics[:, 1:].reshape(len(harmonics), -1)
+    labels = _labels(rows)
+    used = int(labels.max()) + 1
+    entries = _means(rows, labels, used).reshape(used, -1, 3)
+    files = ["shN_centroids.webp", "shN_labels.webp"]
+    index, said = _quantized(entries, {"count": used, "bands": degree, "codebook": [], "files": files})
+    bytes_of_labels = np.stack([labels & 255, labels >> 8, 0 * labels], 1)
+    return {files[0]: _palette_picture(index), files[1]: _picture(bytes_of_labels, shape)}, said
+
+
 def _bent(means: Floats) -> Floats:
     return np.sign(means) * np.log1p(np.abs(means))
 
@@ -231,7 +263,7 @@ def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
             # WebP does not shrink: what claims more than the archive is long is damaged, but for texts.
-            if len(entries) > _MEMBERS or sum(entry.file_size for entry in entries) > 2 * len(data) + (
+            if len(entries) > _MAX_MEMBERS or sum(entry.file_size for entry in entries) > 2 * len(data) + (
                 1 << 22
             ):
                 raise DataError(
@@ -280,7 +312,7 @@ def bundle(parts: Mapping[str, bytes], like: bytes | None = None) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
         for name, content in parts.items():
-            archive.writestr(zipfile.ZipInfo(name, times.get(name, _FIRST)), content)
+            archive.writestr(zipfile.ZipInfo(name, times.get(name, _ARCHIVE_TIME)), content)
     return out.getvalue()
 
 
@@ -291,24 +323,27 @@ class _Pictures:
         self.path = path
         self.parts = parts
         self.meta = meta
-        shape = None
-        if isinstance(meta.get("means"), dict):
+        # Version 1 has the number of Gaussians as the shape of their means.
+        count = meta.get("count")
+        if "count" not in meta and isinstance(meta.get("means"), dict):
             shape = meta["means"].get("shape")
-        count = meta.get("count", shape[0] if isinstance(shape, list) and shape else None)
+            if isinstance(shape, list) and shape:
+                count = shape[0]
         name = self._name("means", 0)
         if count == 0:
             raise DataError(f"{path}: holds no Gaussian")
         if (
             not isinstance(count, int)
             or isinstance(count, bool)
-            or not 0 < count <= _DENSE * len(parts[name]) + _SLACK
+            or not 0 < count <= _MAX_PIXELS_PER_BYTE * len(parts[name]) + _SLACK_PIXELS
         ):
             raise self._wrong(f"{count!r} Gaussians with {len(parts[name])} bytes of positions")
         self.count: int = count
 
     def numbers(self, group: str, name: str, length: int, least: int | None = None) -> Floats:
         """A list of so many finite numbers, or from `least` on."""
-        least = length if least is None else least
+        if least is None:
+            least = length
         try:
             value = self.meta[group][name]
             # Exporters write null in the place of the first number of a codebook that is not finite.
@@ -324,7 +359,8 @@ class _Pictures:
 
     def picture(self, name: str, most: int | None = None) -> _Bytes:
         """An image [H W 4], RGBA, of at most so many pixels."""
-        most = 2 * self.count + _SLACK if most is None else most
+        if most is None:
+            most = 2 * self.count + _SLACK_PIXELS
         try:
             header = header_of(io.BytesIO(self.parts[name]), name)
         except DataError:
@@ -341,9 +377,9 @@ class _Pictures:
             image = None
         if image is None or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
             raise self._wrong(f"{name} cannot be decoded")
-        return np.asarray(
-            cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA), np.uint8
-        )
+        if image.shape[2] == 3:
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGBA), np.uint8)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), np.uint8)
 
     def rows(self, group: str, which: int) -> _Bytes:
         """The pixels [N 4] of an image, one a Gaussian."""
@@ -363,7 +399,7 @@ class _Pictures:
 
     def book(self, group: str, index: NDArray[np.integer[Any]]) -> Floats:
         """A codebook: of as many numbers, at least, as indices use."""
-        return self.numbers(group, "codebook", _LEVELS, int(index.max(initial=0)) + 1)
+        return self.numbers(group, "codebook", _CODEBOOK_NUMBERS, int(index.max(initial=0)) + 1)
 
     def palette(self) -> tuple[NDArray[np.int64], Floats]:
         """The label of each Gaussian, and the harmonics that labels mean [entries K-1 3]; no entries where it
@@ -373,12 +409,12 @@ class _Pictures:
         if about is None:
             return np.zeros(self.count, np.int64), np.zeros((0, 0, 3))
         name = self._name("shN", 0)
-        picture = self.picture(name, _PALETTE * max(COUNTS))
-        coefficients = picture.shape[1] // _ROW
-        entries = picture.shape[0] * _ROW
-        if picture.shape[1] % _ROW or coefficients + 1 not in COUNTS or coefficients == 0:
+        picture = self.picture(name, _MAX_PALETTE_ENTRIES * max(COUNTS))
+        coefficients = picture.shape[1] // _ENTRIES_PER_ROW
+        entries = picture.shape[0] * _ENTRIES_PER_ROW
+        if picture.shape[1] % _ENTRIES_PER_ROW or coefficients + 1 not in COUNTS or coefficients == 0:
             raise self._wrong(
-                f"{name} is {picture.shape[1]} pixels wide; {_ROW} entries of 3, 8 or 15 harmonics are a row"
+                f"{name} is {picture.shape[1]} pixels wide; {_ENTRIES_PER_ROW} entries of 3, 8 or 15 harmonics are a row"
             )
         index = picture[..., :3].reshape(entries, coefficients, 3)
         if "codebook" in about:
@@ -424,13 +460,12 @@ def _folder(path: Path, data: bytes) -> dict[str, bytes]:
 
 def _images(path: Path, meta: Mapping[str, Any]) -> list[str]:
     """Names of the images of a meta.json. Raises DataError for one that may be any other file's."""
-    lists = []
+    names = []
     for group in meta.values():
-        if isinstance(group, dict):
-            lists.append(group.get("files"))
-    names = [name for files in lists if isinstance(files, list) for name in files]
+        if isinstance(group, dict) and isinstance(group.get("files"), list):
+            names += group["files"]
     for name in names:
-        if not isinstance(name, str) or not _NAME.fullmatch(name) or len(names) > _MEMBERS:
+        if not isinstance(name, str) or not _IMAGE_NAME.fullmatch(name) or len(names) > _MAX_MEMBERS:
             raise DataError(f"{path}: {name!r} is no .webp or .png beside it; not a SOG folder")
     return names
 
@@ -466,7 +501,7 @@ def _picture(rows: NDArray[np.integer[Any]], shape: tuple[int, int]) -> _Bytes:
 def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
     """Entries [E K-1 3] in rows of 64."""
     entries, coefficients, _ = index.shape
-    return _picture(index.reshape(-1, 3), (-(-entries // _ROW), _ROW * coefficients))
+    return _picture(index.reshape(-1, 3), (-(-entries // _ENTRIES_PER_ROW), _ENTRIES_PER_ROW * coefficients))
 
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
@@ -498,12 +533,12 @@ def _codebook(values: Floats) -> Floats:
     # Sums of sorted values give the mean of any stretch of them at once.
     ordered = np.sort(values)
     total = np.concatenate([[0.0], np.cumsum(ordered)])
-    ranks = np.rint(np.linspace(0, len(ordered) - 1, _LEVELS)).astype(np.int64)
+    ranks = np.rint(np.linspace(0, len(ordered) - 1, _CODEBOOK_NUMBERS)).astype(np.int64)
     # Half by rank and half by distance: rare far values are not left out. Gaps cost no more than one number.
-    widest = float(np.ptp(np.percentile(ordered, (10, 90)))) / _LEVELS
+    widest = float(np.ptp(np.percentile(ordered, (10, 90)))) / _CODEBOOK_NUMBERS
     along = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(ordered), widest or np.inf))])
-    book = (ordered[ranks] + np.interp(np.linspace(0, along[-1], _LEVELS), along, ordered)) / 2
-    for _ in range(_LLOYD):
+    book = (ordered[ranks] + np.interp(np.linspace(0, along[-1], _CODEBOOK_NUMBERS), along, ordered)) / 2
+    for _ in range(_CODEBOOK_STEPS):
         edges = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
         inside = np.diff(edges)
         book = np.where(inside > 0, np.diff(total[edges]) / np.maximum(inside, 1), book)
@@ -515,7 +550,7 @@ def _labels(rows: Floats) -> NDArray[np.int64]:
 
     A group is cut at the median of the column that varies most in it.
     """
-    if len(rows) <= _PALETTE:
+    if len(rows) <= _MAX_PALETTE_ENTRIES:
         return np.arange(len(rows))
     labels = np.zeros(len(rows), np.int64)
     for level in range(16):

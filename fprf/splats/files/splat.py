@@ -16,8 +16,8 @@ from ..gaussians import Gaussians
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 
-_RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
-_LEAST = 1e-12
+_SPLAT_RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
+_MIN_DEVIATION = 1e-12
 """Standard deviations are at least this, so that their logarithm is finite."""
 
 
@@ -28,21 +28,21 @@ class Splat(CaptureFormat):
     view_dependent: ClassVar[bool] = False
 
     def recognises(self, head: bytes, size: int) -> bool:
-        return size > 0 and size % _RECORD.itemsize == 0
+        return size > 0 and size % _SPLAT_RECORD.itemsize == 0
 
     def read(self, path: Path, data: Data) -> Capture:
         if not self.recognises(b"", len(data)):
             raise DataError(
-                f"{path}: {len(data)} bytes; a .splat file has {_RECORD.itemsize} for each Gaussian"
+                f"{path}: {len(data)} bytes; a .splat file has {_SPLAT_RECORD.itemsize} for each Gaussian"
             )
-        whole = np.frombuffer(data, _RECORD)
+        whole = np.frombuffer(data, _SPLAT_RECORD)
 
         def part(rows: slice) -> tuple[Floats, ...]:
             table = whole[rows]
             # Bytes stand for shares; opacities of 0 and 1 keep a finite logit.
             share = table["rgba"] / 255
             turns = (table["turn"].astype(np.float32) - 128) / 128
-            scales = np.log(np.maximum(table["deviation"], _LEAST))
+            scales = np.log(np.maximum(table["deviation"], _MIN_DEVIATION))
             return table["mean"], turns, scales, base.logit(share[:, 3]), base.constants_of(share[:, :3])
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
@@ -56,7 +56,7 @@ class Splat(CaptureFormat):
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """In the order of the Gaussians. The file cannot say that they are antialiased."""
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
-        table = np.empty(len(gaussians), _RECORD)
+        table = np.empty(len(gaussians), _SPLAT_RECORD)
         table["mean"], table["deviation"] = means, np.exp(scales)
         table["rgba"][:, :3] = base.steps(base.colours_of(harmonics), 255)
         table["rgba"][:, 3] = base.steps(base.sigmoid(logits), 255)

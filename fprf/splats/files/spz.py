@@ -42,7 +42,7 @@ _ANTIALIASED_FLAG = 1
 _EXTENSIONS_FLAG = 2
 _MAX_FRACTION = 23
 """Fractional bits of positions at most: of 24 bits one is the sign."""
-_MAX_POSITION = 2**23 - 1
+_MAX_POSITION_STEPS = 2**23 - 1
 """In the steps of positions."""
 _MIN_EXTENT = 1e-9
 """Of coordinates, so that the logarithm of steps is finite."""
@@ -58,7 +58,7 @@ _LN_SIZE_RANGE = (-10.0, 5.9375)
 """Smallest and largest ln-scale: bytes 0 and 255."""
 _LN_SIZE_STEPS = 16
 """A unit of ln-scale."""
-_MAX_DEFLATE_RATIO = 1032
+_MAX_GZIP_RATIO = 1032
 """Times its size that deflated data may unpack to at most (zlib)."""
 _MAX_ZSTD_RATIO = 64
 """The same of positions of version 4, which hardly shrink in captures, and some bytes for small files."""
@@ -242,7 +242,7 @@ class Spz(CaptureFormat):
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
         fraction = -int(np.log2(_step(means)))
         steps = np.rint(means.astype(np.float64) * 2.0**fraction)
-        at = np.clip(steps, -_MAX_POSITION - 1, _MAX_POSITION).astype(np.int64) & 0xFFFFFF
+        at = np.clip(steps, -_MAX_POSITION_STEPS - 1, _MAX_POSITION_STEPS).astype(np.int64) & 0xFFFFFF
         ln_sizes = (base.finite(scales) - _LN_SIZE_RANGE[0]) * _LN_SIZE_STEPS
         tint, rest = _colour_bytes(base.finite(harmonics))
         flags = _EXTENSIONS_FLAG | (_ANTIALIASED_FLAG if antialiased else 0)
@@ -262,7 +262,7 @@ class Spz(CaptureFormat):
         """Those within the reach of 24 bits whose steps suit the bulk."""
         means = gaussians.means.numpy()
         precise = base.precise(means, lambda kept, _: _step(kept), _MAX_STEP_OF_SPZ)
-        return np.asarray(precise & (np.abs(means) <= _MAX_POSITION).all(1))
+        return np.asarray(precise & (np.abs(means) <= _MAX_POSITION_STEPS).all(1))
 
     def notes(self, gaussians: Gaussians) -> list[str]:
         means = gaussians.means.numpy()
@@ -286,9 +286,9 @@ class Spz(CaptureFormat):
 def _step(means: Floats) -> float:
     """Distance between positions that 24 bits tell apart; infinite for those that they do not reach."""
     largest = float(np.abs(means).max(initial=0.0))
-    if largest > _MAX_POSITION:
+    if largest > _MAX_POSITION_STEPS:
         return np.inf
-    fraction = np.floor(np.log2(_MAX_POSITION / max(largest, _MIN_EXTENT)))
+    fraction = np.floor(np.log2(_MAX_POSITION_STEPS / max(largest, _MIN_EXTENT)))
     return float(2.0 ** -np.clip(fraction, 0, _MAX_FRACTION))
 
 
@@ -370,8 +370,8 @@ def _unzip(path: Path, data: Data) -> tuple[bytes, bytes]:
                     if header.version > 3:
                         raise DataError(f"{path}: .spz of version 4 within gzip; unpack it first (gunzip)")
                     most += sum(header.sizes) + _MAX_TRAILER_BYTES
-                    if sum(header.sizes) > _MAX_DEFLATE_RATIO * len(data):
-                        needed = sum(header.sizes) // _MAX_DEFLATE_RATIO
+                    if sum(header.sizes) > _MAX_GZIP_RATIO * len(data):
+                        needed = sum(header.sizes) // _MAX_GZIP_RATIO
                         raise base.short(path, len(data), needed, f"{header.number} Gaussians")
                 if not got and not piece and not packer.eof:
                     return bytes(content), b""

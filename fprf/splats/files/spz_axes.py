@@ -26,8 +26,8 @@ _COORDINATE_SYSTEM = 0xADBE0003
 """Type of the extension that says which axes a file has; its payload is their number."""
 _RECORD_HEAD = struct.Struct("<II")
 """Type of an extension and length of its payload, which follows."""
-_NUMBER = struct.Struct("<I")
-_MAX_NUMBER = 16
+_AXES_NUMBER = struct.Struct("<I")
+_MAX_AXES_NUMBER = 16
 """Numbers of axes: three bits for the ends of the axes, one for y and z swapped."""
 _LIBRARY_FRACTION = 12
 """Fractional bits of positions in files of Niantic's library and all that build on it. fprf fits them to the
@@ -88,7 +88,7 @@ OWN_AXES = Axes(False, (1.0, -1.0, -1.0))
 
 def axes_record() -> bytes:
     """The extension that says that a file has the axes of PLY files."""
-    return _RECORD_HEAD.pack(_COORDINATE_SYSTEM, _NUMBER.size) + _NUMBER.pack(RIGHT_DOWN_FRONT)
+    return _RECORD_HEAD.pack(_COORDINATE_SYSTEM, _AXES_NUMBER.size) + _AXES_NUMBER.pack(RIGHT_DOWN_FRONT)
 
 
 def said_axes(path: Path, extensions: bytes, degree: int) -> Axes | None:
@@ -105,16 +105,16 @@ def said_axes(path: Path, extensions: bytes, degree: int) -> Axes | None:
         end = at + _RECORD_HEAD.size + size
         if end > len(extensions):
             raise base.short(path, len(extensions), end, "extensions")
-        if kind == _COORDINATE_SYSTEM and size == _NUMBER.size:
-            (said,) = _NUMBER.unpack_from(extensions, end - size)
+        if kind == _COORDINATE_SYSTEM and size == _AXES_NUMBER.size:
+            (said,) = _AXES_NUMBER.unpack_from(extensions, end - size)
             number = said or RIGHT_UP_BACK  # 0 stands for the format's own
             break
         at = end
     if number == 0:
         return None
-    if number > _MAX_NUMBER:
+    if number > _MAX_AXES_NUMBER:
         raise DataError(
-            f"{path}: axes of number {number} (SPZ_ADOBE_coordinate_system); 1 to {_MAX_NUMBER} are known"
+            f"{path}: axes of number {number} (SPZ_ADOBE_coordinate_system); 1 to {_MAX_AXES_NUMBER} are known"
         )
     # Right, up and front are bits, another one swaps y and z.
     right, up, front, turned = (number - 1 >> k & 1 for k in range(4))

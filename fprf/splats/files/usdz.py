@@ -20,7 +20,7 @@ from ..gaussians import COUNTS, Gaussians
 from . import base
 from .base import Capture, CaptureFormat, Data
 
-_TURN = np.array([1.0, -1.0, -1.0])
+_MIRROR = np.array([1.0, -1.0, -1.0])
 """The diagonal of the turn from right down front to right up back."""
 
 
@@ -52,11 +52,11 @@ class Usdz(CaptureFormat):
 
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
         bands = min(harmonics.shape[1], COUNTS[3])
-        harmonics = np.matmul(base.turned_harmonics(np.diag(_TURN), bands), harmonics[:, :bands])
+        harmonics = np.matmul(base.turned_harmonics(np.diag(_MIRROR), bands), harmonics[:, :bands])
         # The product of the turn, a quaternion of x alone, and those of the Gaussians; w is last in memory.
         w, x, y, z = base.unit_quaternions(turns).T
         columns = [
-            ("Positions", Vt.Vec3fArray, means * _TURN),
+            ("Positions", Vt.Vec3fArray, means * _MIRROR),
             ("Orientations", Vt.QuatfArray, np.stack([w, -z, y, -x], 1)),
             ("Scales", Vt.Vec3fArray, np.exp(scales.clip(-80, 80))),
             ("Opacities", Vt.FloatArray, base.sigmoid(logits)),
@@ -75,7 +75,7 @@ class Usdz(CaptureFormat):
                 getattr(field, f"Create{name}Attr")(array)
             field.CreateRadianceSphericalHarmonicsDegreeAttr(round(bands**0.5) - 1)
             field.CreateSortingModeHintAttr(UsdVol.Tokens.cameraDistance)
-            bounds = np.stack([(means * _TURN).min(0), (means * _TURN).max(0)])
+            bounds = np.stack([(means * _MIRROR).min(0), (means * _MIRROR).max(0)])
             field.CreateExtentAttr([Gf.Vec3f(*map(float, corner)) for corner in bounds])
             stage.GetRootLayer().Save()
             if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(layer), package):
