@@ -26,7 +26,7 @@ _THUMBNAILS = "thumbnails"
 _MAPS = "masks and maps of other photographs"
 _RECONSTRUCTION = "pictures of a reconstruction"
 _RAW_TWINS = "raw files of other photographs"
-_REDUCED = "reduced copies of other photographs"
+_REDUCED_COPIES = "reduced copies of other photographs"
 
 _FOLDERS_OF_OTHERS = frozenset(("__macosx", "$recycle.bin", "#recycle", "@recycle", "lost+found"))
 _FOLDERS_OF_MODELS = frozenset(("sparse", "stereo", "distorted"))
@@ -179,7 +179,7 @@ def _reduced(files: Sequence[Path]) -> dict[Path, str]:
         for other, theirs in folders.items():
             pairs = [(path, theirs[stem]) for stem, path in members.items() if stem in theirs]
             if other != folder and len(pairs) == len(members) and _are_reduced(pairs):
-                found |= dict.fromkeys(members.values(), _REDUCED)
+                found |= dict.fromkeys(members.values(), _REDUCED_COPIES)
                 break
     return found
 

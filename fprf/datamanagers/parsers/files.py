@@ -29,9 +29,9 @@ Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | Non
 
 _MAX_ARRAY = 1 << 32
 """Bytes that an array inside an archive may unpack to: by eye, as many as a machine of today holds."""
-_MAX_DEFLATE_RATIO = 1032
+_MAX_ARCHIVE_RATIO = 1032
 """Times its size that deflated data may unpack to: the format's limit."""
-_MAX_NUMBER = 1e300
+_MAX_JSON_NUMBER = 1e300
 """Numbers of JSON beyond it are refused: their products would overflow."""
 _MAX_SHOWN = 60
 """Characters of a wrong value that a message repeats: by eye."""
@@ -273,7 +273,7 @@ def read_npz(path: Path, key: str) -> NDArray[np.float64]:
                 )
             # What is claimed is allocated before it is read.
             held = path.stat().st_size
-            if entry.compress_size > held or entry.file_size > _MAX_DEFLATE_RATIO * held:
+            if entry.compress_size > held or entry.file_size > _MAX_ARCHIVE_RATIO * held:
                 raise DataError(
                     f"{path}: {key} claims {entry.file_size} bytes, but the file has {held}; copy it again"
                 )
@@ -393,7 +393,11 @@ def _number(value: Json) -> float | None:
     """A number of JSON as float64, finite or not; None for anything else, and beyond 1e300, where products
     overflow.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float) or _MAX_NUMBER < abs(value) < math.inf:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or _MAX_JSON_NUMBER < abs(value) < math.inf
+    ):
         return None
     return float(value)
 

@@ -21,7 +21,7 @@ from ..images import read_header
 
 _MAX_SKEW = 1e-3
 """Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""
-_MAX_POSITION = 1e12
+_MAX_COORDINATE = 1e12
 """Largest coordinate of a camera: beyond it float64 has no millimetres left."""
 _MAX_INTRINSIC = 1e9
 """Largest number of a lens, in pixels: no camera's, and its products stay within float64 (by eye)."""
@@ -250,9 +250,9 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         raise DataError(
             f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses"
         )
-    if np.abs(matrix[:3, 3]).max() > _MAX_POSITION:
+    if np.abs(matrix[:3, 3]).max() > _MAX_COORDINATE:
         raise DataError(
-            f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_MAX_POSITION:g}; run the reconstruction again"
+            f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_MAX_COORDINATE:g}; run the reconstruction again"
         )
     # The nearest rotation: what is left of R = U S V^T without its stretching S.
     left, _, right = np.linalg.svd(rotation)
