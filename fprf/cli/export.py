@@ -248,18 +248,17 @@ class _Export:
         return {"gaussians": count, "losses": [*losses]}
 
     def _fitted(self) -> Iterator["GaussianRows"]:
-        from ..export.fit import fit_gaussians
+        from ..export.fit import Limits, fit_gaussians
         from ..splats.gaussians import GaussianRows
 
-        fitted = fit_gaussians(
-            self.opened.scene,
-            self.views,
-            self.plain,
-            [look.restyle for look in self.looks],
+        limits = Limits(
             minutes=self.config.fit or FIT_MINUTES,
             cap=self.config.fit_cap,
             background=self.opened.known.facts.background,
-            report=self.display.count,
+        )
+        looks = [look.restyle for look in self.looks]
+        fitted = fit_gaussians(
+            self.opened.scene, self.views, self.plain, looks, limits, report=self.display.count
         )
         return (GaussianRows(len(gaussians), gaussians.select, True) for gaussians in fitted)
 

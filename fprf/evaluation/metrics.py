@@ -48,22 +48,26 @@ PSNR_CAP = 99.0
 1.3e-10.
 """
 
-_WINDOW = 11
+_SSIM_WINDOW_PIXELS = 11
+"""Side of SSIM's window (Wang et al. 2004)."""
 _LPIPS_WEIGHTS = Path(__file__).parent / "weights" / "lpips-alex.safetensors"
-_STRIDES = (4, 1, 1, 1, 1)
-_PADS = (2, 2, 1, 1, 1)
-_POOLED = (2, 3)
+_ALEXNET_STRIDES = (4, 1, 1, 1, 1)
+"""Of its five convolutions."""
+_ALEXNET_PADS = (2, 2, 1, 1, 1)
+"""Of its five convolutions."""
+_ALEXNET_POOLED = (2, 3)
 """Convolutions after a pooling."""
-_SHIFT = (-0.030, -0.088, -0.188)
-_SCALE = (0.458, 0.448, 0.450)
-"""Of colours in [-1, 1]: ImageNet's mean and deviation."""
-_EPS = 1e-10
+_IMAGENET_MEAN = (-0.030, -0.088, -0.188)
+"""Of colours in [-1, 1], as LPIPS has it."""
+_IMAGENET_DEVIATION = (0.458, 0.448, 0.450)
+"""Of colours in [-1, 1], as LPIPS has it."""
+_LPIPS_EPS = 1e-10
 """Added to lengths, as the authors do: a feature may be 0."""
-_SMALLEST = 31
+_MIN_LPIPS_SIDE_PIXELS = 31
 """Pixels of a side that the second pooling leaves one of."""
-_SAME_PLACE = 0.02
+_MAX_DISTANCE_SHARE = 0.02
 """Share of the distance below which two surfaces count as one. Bilinear depth on a slope is off by far
-less.
+less. By eye.
 """
 
 
@@ -111,7 +115,7 @@ def ssim(
     first, second = _pair(a, b)
     # The window must be odd, and fit.
     shortest = min(first.shape[:2])
-    window = min(_WINDOW, shortest - 1 + shortest % 2)
+    window = min(_SSIM_WINDOW_PIXELS, shortest - 1 + shortest % 2)
     x = first.permute(2, 0, 1)[None]
     y = second.permute(2, 0, 1)[None]
     # No eps: K keeps the denominator above 9e-8, and kornia's 1e-12 would cost black images 1e-5.
@@ -143,14 +147,14 @@ def lpips(
     for name, value in _weights().items():
         weights[name] = value.to(a.device)
     pair = torch.stack([a, b]).float().permute(0, 3, 1, 2)
-    if min(pair.shape[2:]) < _SMALLEST:
-        scale = _SMALLEST / min(pair.shape[2:])
-        size = [max(_SMALLEST, round(scale * n)) for n in pair.shape[2:]]
+    if min(pair.shape[2:]) < _MIN_LPIPS_SIDE_PIXELS:
+        scale = _MIN_LPIPS_SIDE_PIXELS / min(pair.shape[2:])
+        size = [max(_MIN_LPIPS_SIDE_PIXELS, round(scale * n)) for n in pair.shape[2:]]
         pair = F.interpolate(pair, size, mode="bilinear", align_corners=False)
     total = 0.0
     for layer, features in enumerate(_activations(weights, pair), start=1):
         # Features of unit length, compared channel by channel by the weights of the layer's head.
-        first, second = features / (features.square().sum(1, keepdim=True).sqrt() + _EPS)
+        first, second = features / (features.square().sum(1, keepdim=True).sqrt() + _LPIPS_EPS)
         apart = torch.einsum("chw,c->hw", (first - second).square(), weights[f"head{layer}"]).double()
         # A cell counts by the share of it that lies in the mask.
         share = torch.ones_like(apart)
@@ -164,11 +168,11 @@ def _activations(
     weights: Mapping[str, Tensor], images: Annotated[Tensor, "B 3 H W"]
 ) -> Iterator[Annotated[Tensor, "B C h w"]]:
     """Of AlexNet's convolutions, one after the other."""
-    shift = images.new_tensor(_SHIFT).view(1, 3, 1, 1)
-    scale = images.new_tensor(_SCALE).view(1, 3, 1, 1)
+    shift = images.new_tensor(_IMAGENET_MEAN).view(1, 3, 1, 1)
+    scale = images.new_tensor(_IMAGENET_DEVIATION).view(1, 3, 1, 1)
     x = (2 * images - 1 - shift) / scale
-    for layer, (stride, padding) in enumerate(zip(_STRIDES, _PADS, strict=True), start=1):
-        if layer in _POOLED:
+    for layer, (stride, padding) in enumerate(zip(_ALEXNET_STRIDES, _ALEXNET_PADS, strict=True), start=1):
+        if layer in _ALEXNET_POOLED:
             x = F.max_pool2d(x, 3, 2)
         x = F.relu(F.conv2d(x, weights[f"conv{layer}.weight"], weights[f"conv{layer}.bias"], stride, padding))
         yield x
@@ -280,7 +284,7 @@ def warp(
     # there.
     distance = (points - cameras.pose[b, :, 3]).norm(dim=-1)
     met = look_up(torch.where(torch.isfinite(depth_b), depth_b, 0.0)[..., None], pixel)[:, 0]
-    same = (met - distance).abs() <= _SAME_PLACE * distance
+    same = (met - distance).abs() <= _MAX_DISTANCE_SHARE * distance
     valid = (solid & inside & same).reshape(depth_a.shape)
     colour = look_up(image_b, pixel).reshape(*depth_a.shape, 3).to(image_b)
     return torch.where(valid[..., None], colour, torch.zeros_like(colour)), valid
@@ -315,9 +319,8 @@ class WarpError:
             here = image_a[valid].double()
             there = warped[valid].double()
             self.squared += float((here - there).square().sum())
-            self.variation += (
-                sum(float((colour - colour.mean(dim=0)).square().sum()) for colour in (here, there)) / 2
-            )
+            for colour in (here, there):
+                self.variation += float((colour - colour.mean(dim=0)).square().sum()) / 2
 
     def summary(self) -> dict[str, float | int | None]:
         """Warp error: `rmse` (of [0, 1]), `relative` (to the contrast), `valid_share`, `pairs`.

@@ -5,7 +5,7 @@ hold the same Gaussians in the same order.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +26,16 @@ from ..style.look import Restyle
 from ..training.driver import Schedule, learn
 from .mesh import Maps
 
-_ALIKE = 0.7
-"""Cosine between the axes of views that have a view between them."""
-_COLOURS = 0.3
-"""Time for the colours of a further look, as a share of that for the geometry."""
-_BEGIN = 0.7
-"""Gaussians that are there at the start, as a share of the most."""
-_SKY = 3.0
-"""Distance of points in the sky, in distances of the outermost of all others from the middle of the views."""
+_MIN_AXES_COSINE = 0.7
+"""Cosine between the axes of views that have a view between them: up to 45 degrees. By eye."""
+_COLOURS_TIME_SHARE = 0.3
+"""Time for the colours of a further look, as a share of that for the geometry. By eye."""
+_FIRST_GAUSSIANS_SHARE = 0.7
+"""Gaussians that are there at the start, as a share of the most: learning splits them where it
+needs more. By eye."""
+_SKY_DISTANCE_RATIO = 3.0
+"""Distance of points in the sky, in distances of the outermost of all others from the middle of the views.
+By eye."""
 
 
 def seen_points(maps: Maps, most: int) -> Points:
@@ -54,10 +56,22 @@ def seen_points(maps: Maps, most: int) -> Points:
     # What sees no surface is put on a dome beyond all that there is.
     solid = at.isfinite().all(1)
     if bool(solid.any()):
-        far = _SKY * float((at[solid] - middle).norm(dim=1).max())
+        far = _SKY_DISTANCE_RATIO * float((at[solid] - middle).norm(dim=1).max())
     else:
         far = 1.0
     return Points(torch.where(solid[:, None], at, middle + far * direction).numpy(), shade.float().numpy())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How long and how many Gaussians are fitted, and before what."""
+
+    minutes: float
+    """Time for the geometry, after rendering; a further look gets a share of it."""
+    cap: int
+    """Gaussians, at most."""
+    background: tuple[float, float, float] | None = None
+    """sRGB in [0, 1]; None: black."""
 
 
 def fit_gaussians(
@@ -65,16 +79,14 @@ def fit_gaussians(
     views: Cameras,
     maps: Maps,
     looks: Sequence[Restyle | None],
+    limits: Limits,
     *,
-    minutes: float,
-    cap: int,
-    background: tuple[float, float, float] | None = None,
     report: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Iterator[Gaussians]:
-    """Gaussians of each look, trained for `minutes` after rendering.
+    """Gaussians of each look, trained within `limits` after rendering.
 
     What is rendered are `views` and as many between them. Gaussians begin where `maps` of the views have
-    surfaces; there are at most `cap` in the end.
+    surfaces.
     """
     # The scene is photographed from the views and between them, and learnt like any other.
     cameras = _with_midpoints(views)
@@ -82,10 +94,10 @@ def fit_gaussians(
     paths = (Path("scene"),) * len(cameras)
     parsed = ParsedScene(name="scene", paths=paths, cameras=cameras, train=every, test=every[:0])
     draw = np.random.default_rng(0)
-    points = seen_points(maps, max(1, round(_BEGIN * cap)))
+    points = seen_points(maps, max(1, round(_FIRST_GAUSSIANS_SHARE * limits.cap)))
     near = find_near(parsed, points)
-    config = GaussiansConfig(cap=cap, background=background or (0.0, 0.0, 0.0))
-    bounds = Bounds(room=cap, scene_scale=scene_scale(parsed))
+    config = GaussiansConfig(cap=limits.cap, background=limits.background or (0.0, 0.0, 0.0))
+    bounds = Bounds(room=limits.cap, scene_scale=scene_scale(parsed))
     learner = None
     for number, look in enumerate(looks):
         shown = scene.restyled(look)
@@ -99,13 +111,13 @@ def fit_gaussians(
         if learner is None:
             learner = GaussianLearner(config, levels, bounds)
             learner.begin_at(points, draw)
-            seconds = 60 * minutes
+            seconds = 60 * limits.minutes
         else:
             before = learner
             colours = Stage(only="colours")
             learner = GaussianLearner(replace(config, coarse=0.0), levels, bounds, stage=colours)
             learner.start_from(before.gaussians())
-            seconds = 60 * minutes * _COLOURS
+            seconds = 60 * limits.minutes * _COLOURS_TIME_SHARE
         what = "fitting Gaussians" if number == 0 else "fitting colours"
 
         def show(event: Report, what: str = what) -> None:
@@ -123,13 +135,16 @@ def _with_midpoints(cameras: Cameras) -> Cameras:
     centre = pose[:, :, 3]
     turns = pose[:, :, :3]
     alike = torch.einsum("va,wa->vw", turns[:, :, 2], turns[:, :, 2])
-    apart = torch.cdist(centre, centre).masked_fill(alike < _ALIKE, torch.inf).fill_diagonal_(torch.inf)
+    apart = (
+        torch.cdist(centre, centre).masked_fill(alike < _MIN_AXES_COSINE, torch.inf).fill_diagonal_(torch.inf)
+    )
     distance, other = apart.min(1)
     # The rotation nearest to the mean of both, and the middle between their places.
     left, _, right = torch.linalg.svd((turns + turns[other]) / 2)
     between = torch.cat([left @ right, ((centre + centre[other]) / 2)[:, :, None]], 2)
     chosen = (distance < torch.inf).nonzero()[:, 0]
     added = replace(cameras, pose=between).select(chosen)
-    return Cameras(
-        *(torch.cat([getattr(part, field.name) for part in (cameras, added)]) for field in fields(Cameras))
-    )
+    joined = []
+    for field in fields(Cameras):
+        joined.append(torch.cat([getattr(cameras, field.name), getattr(added, field.name)]))
+    return Cameras(*joined)

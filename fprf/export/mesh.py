@@ -36,39 +36,44 @@ from ..types import Origin
 
 Report = Callable[[int, int], None]
 
-_SOLID = 0.5
-"""Pixels of a smaller opacity see nothing."""
-_TORN = 1.25
+_MIN_SEEN_OPACITY = 0.5
+"""Pixels of a smaller opacity see nothing: more of what they show lies behind. By eye."""
+_MAX_DEPTH_RATIO = 1.25
 """Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground
-falls away fast.
+falls away fast. By eye.
 """
-_NEAR = 6.0
+_MAX_PIXEL_WIDTHS = 6.0
 """Pixels more than so many times as wide as the median one stay out: far surfaces are known too coarsely for
-a mesh.
+a mesh. By eye.
 """
-_FINE = 2.0
-"""Edge of the lattice in widths of the median pixel on the surface, unless the user says otherwise."""
-_BLOCK = 4
-"""Lattice points come in cubes of so many a side."""
-_AROUND = 1.5
-"""Edges about what is seen in which there are lattice points."""
-_AGREE = 2
-"""Views that must see something in a block, and say something of a lattice point."""
-_MOST = 8_000_000
-"""Lattice points, at most."""
-_SPAN = 1 << 18
-"""Lattice points to either side of the origin that keys tell apart."""
-_TRUNCATION = 3.0
-"""Distances are cut at so many edges."""
-_STEEP = 0.1
+_LATTICE_PIXELS = 2.0
+"""Edge of the lattice in widths of the median pixel on the surface, unless the user says otherwise:
+finer, noise of the depths shows. By eye."""
+_CUBE_SIDE = 4
+"""Lattice points of a cube, in which they come, along a side: larger ones hold more air. By eye."""
+_MARGIN_EDGES = 1.5
+"""Edges about what is seen in which there are lattice points: the surface's own cell, and half of the next."""
+_MIN_AGREEING_VIEWS = 2
+"""Views that must see something in a block, and say something of a lattice point: what
+one alone sees is the air before an edge."""
+_MAX_LATTICE_POINTS = 8_000_000
+"""Lattice points: about 1 GB of memory."""
+_MAX_COORDINATE = 1 << 18
+"""Lattice points to either side of the origin that keys tell apart: three of 19 bits fit int64."""
+_TRUNCATION_EDGES = 3.0
+"""Distances are cut at so many edges: beyond, a surface of another side would be met. By eye."""
+_MIN_COSINE = 0.1
 """Smallest cosine that distances are multiplied with: below, a depth map knows little of the surface's
-place.
+place. By eye.
 """
-_CLEAR = 0.3
-"""Weight of a view that looks past a lattice point, against one that sees a surface there head-on."""
-_LOOSE = 2e-3
-"""Pieces with a smaller share of all triangles are dropped."""
-_CHUNK = 1 << 18
+_PASSING_WEIGHT = 0.3
+"""Weight of a view that looks past a lattice point, against one that sees a surface there head-on. By eye."""
+_MIN_PIECE_SHARE = 2e-3
+"""Pieces with a smaller share of all triangles are dropped: they float in the air. By eye."""
+_MIN_PIECE_TRIANGLES = 8
+"""Pieces with fewer triangles are dropped from any mesh. By eye."""
+_POINTS_AT_ONCE = 1 << 18
+"""Lattice points that are looked at together: bounds the memory."""
 
 
 class Maps(NamedTuple):
@@ -111,7 +116,7 @@ def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, repo
     for view in range(len(small)):
         report(view, len(small))
         shown = scene.render(small, view, resolution=1.0)
-        seen = (shown.opacity > _SOLID) & (shown.depth > 0) & (shown.depth < reach)
+        seen = (shown.opacity > _MIN_SEEN_OPACITY) & (shown.depth > 0) & (shown.depth < reach)
         maps.depth.append(torch.where(seen, shown.depth, torch.inf))
         maps.rgb.append(shown.rgb)
     report(len(small), len(small))
@@ -127,7 +132,7 @@ def build_mesh(maps: Maps, *, edge: float | None = None, report: Report = lambda
     # Small pieces float in the air, or stand for nothing that anyone looks at.
     piece = _components(len(at), face)
     size = torch.bincount(piece[face[:, 0]], minlength=len(at))
-    face = face[size[piece[face[:, 0]]] >= max(8, _LOOSE * len(face))]
+    face = face[size[piece[face[:, 0]]] >= max(_MIN_PIECE_TRIANGLES, _MIN_PIECE_SHARE * len(face))]
     if not len(face):
         raise DataError(
             "export: no surface for a mesh; train longer, raise --mesh-edge, or export ply or splat instead"
@@ -177,7 +182,7 @@ def _gaps(
     nearest = maps.depth[view].double()[y, x]
     # 1 / depth of a plane is linear in pixels; where the surface is torn the nearest pixel's depth counts.
     between = 1 / look_up(1 / maps.depth[view].double()[..., None], pixel[inside])[:, 0]
-    whole = (between < _TORN * nearest) & (nearest < _TORN * between)
+    whole = (between < _MAX_DEPTH_RATIO * nearest) & (nearest < _MAX_DEPTH_RATIO * between)
     gap = torch.full_like(distance, torch.nan)
     gap[inside] = torch.where(whole, between, nearest) - distance[inside]
     return gap, distance, pixel
@@ -202,24 +207,26 @@ def _lattice(
     finest = float(width.median())
     for view, depth in enumerate(maps.depth):
         centre, direction = grid_rays(maps.cameras, view)
-        near = (depth / maps.cameras.focal[view].mean() <= _NEAR * finest).view(-1)
+        near = (depth / maps.cameras.focal[view].mean() <= _MAX_PIXEL_WIDTHS * finest).view(-1)
         seen.append((centre + direction * depth.view(-1, 1))[near] - origin)
-    edge = _FINE * finest if edge is None else edge
+    edge = _LATTICE_PIXELS * finest if edge is None else edge
+    signs = torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
     while True:
         # A block counts where several views see something in or beside it: what one alone sees is the air
         # before an edge.
-        around = _AROUND * edge * torch.cartesian_prod(*(torch.tensor([-1.0, 1.0], dtype=torch.float64),) * 3)
-        each = (((points[:, None] + around).view(-1, 3) / (edge * _BLOCK)).floor().long() for points in seen)
-        block, views = torch.unique(
-            torch.cat([torch.unique(b, dim=0) for b in each]), dim=0, return_counts=True
-        )
-        block = block[views >= _AGREE]
-        if len(block) * _BLOCK**3 <= _MOST:
+        around = _MARGIN_EDGES * edge * signs
+        near_view = []
+        for points in seen:
+            cube = ((points[:, None] + around).view(-1, 3) / (edge * _CUBE_SIDE)).floor().long()
+            near_view.append(torch.unique(cube, dim=0))
+        block, views = torch.unique(torch.cat(near_view), dim=0, return_counts=True)
+        block = block[views >= _MIN_AGREEING_VIEWS]
+        if len(block) * _CUBE_SIDE**3 <= _MAX_LATTICE_POINTS:
             break
         edge *= 2
-    inner = torch.cartesian_prod(*(torch.arange(_BLOCK),) * 3)
-    cell = (block[:, None] * _BLOCK + inner).view(-1, 3)
-    return cell[cell.abs().amax(1) < _SPAN - 2], origin, edge
+    inner = torch.cartesian_prod(*(torch.arange(_CUBE_SIDE),) * 3)
+    cell = (block[:, None] * _CUBE_SIDE + inner).view(-1, 3)
+    return cell[cell.abs().amax(1) < _MAX_COORDINATE - 2], origin, edge
 
 
 def _signed_distance(
@@ -228,7 +235,7 @@ def _signed_distance(
     """Mask of the lattice points that enough views say something of, and their distances, in truncations:
     [-1, 1], float32.
     """
-    far = _TRUNCATION * edge
+    far = _TRUNCATION_EDGES * edge
     total = torch.zeros(len(cell))
     weight = torch.zeros(len(cell))
     count = torch.zeros(len(cell), dtype=torch.int16)
@@ -239,12 +246,12 @@ def _signed_distance(
             .sum(-1)
             .view(depth.shape)
         )
-        for part in torch.split(torch.arange(len(cell)), _CHUNK):
+        for part in torch.split(torch.arange(len(cell)), _POINTS_AT_ONCE):
             gap, distance, pixel = _gaps(maps, view, origin + edge * cell[part].double())
-            close = gap.abs() < far / _STEEP
-            slope = torch.full_like(gap, _CLEAR)
+            close = gap.abs() < far / _MIN_COSINE
+            slope = torch.full_like(gap, _PASSING_WEIGHT)
             x, y = pixel[close].long().unbind(-1)
-            slope[close] = facing[y, x].clamp_min(_STEEP)
+            slope[close] = facing[y, x].clamp_min(_MIN_COSINE)
             # Far in front of a surface nobody asks how it lies; behind it the view knows nothing.
             value = torch.where(close, (gap * slope / far).clamp(max=1), torch.where(gap > 0, 1.0, torch.nan))
             seen = value >= -1
@@ -254,12 +261,26 @@ def _signed_distance(
             weight[here] += share
             count[here] += 1
     report(len(maps.depth), len(maps.depth))
-    known = count >= _AGREE
+    known = count >= _MIN_AGREEING_VIEWS
     return known, total[known] / weight[known]
 
 
-_CORNERS = torch.cartesian_prod(*(torch.arange(2),) * 3)
-_EDGES = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
+_CUBE_CORNERS = torch.cartesian_prod(*(torch.arange(2),) * 3)
+"""Corners of a cell, from its lowest one."""
+
+
+def _edges_of_cube() -> list[tuple[int, int]]:
+    """Pairs of corners that differ along one axis."""
+    edges = []
+    for a in range(8):
+        for b in range(a):
+            if (a ^ b).bit_count() == 1:
+                edges.append((a, b))
+    return edges
+
+
+_CUBE_EDGES = _edges_of_cube()
+"""The 12 edges of a cell, by the numbers of their corners."""
 
 
 def surface_nets(
@@ -267,7 +288,7 @@ def surface_nets(
 ) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "F 3"]]:
     """Vertices in lattice coordinates (float64) and triangles (int64), counter-clockwise seen from outside.
 
-    Lattice points are integers within `_SPAN`, each at most once. What borders on a point without a value is
+    Lattice points are integers within `_MAX_COORDINATE`, each at most once. What borders on a point without a value is
     open.
     """
     if not len(cell):
@@ -284,18 +305,18 @@ def surface_nets(
 
     def mixed(part: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         """Cells with all corners, and both signs among them."""
-        corner = find(part[:, None] + _CORNERS)
+        corner = find(part[:, None] + _CUBE_CORNERS)
         signs = inside[corner.clamp_min(0)]
         return (corner >= 0).all(1) & signs.any(1) & ~signs.all(1)
 
     # A vertex for each such cell: the mean of the zero crossings on its edges, from its lowest corner.
-    crossed = torch.cat([mixed(part) for part in torch.split(cell, _CHUNK)])
+    crossed = torch.cat([mixed(part) for part in torch.split(cell, _POINTS_AT_ONCE)])
     vertex = torch.full((len(cell),), -1)
     vertex[crossed] = torch.arange(int(crossed.sum()))
-    corner = value[find(cell[crossed][:, None] + _CORNERS)]
+    corner = value[find(cell[crossed][:, None] + _CUBE_CORNERS)]
     # On each of the 12 edges of a cell the zero lies where the values say, if their signs differ.
-    (first, second) = torch.tensor(_EDGES).T
-    place = _CORNERS.double()
+    (first, second) = torch.tensor(_CUBE_EDGES).T
+    place = _CUBE_CORNERS.double()
     crosses = (corner[:, first] < 0) != (corner[:, second] < 0)
     part = corner[:, first] / torch.where(crosses, corner[:, first] - corner[:, second], 1.0)
     along = place[first] + part[..., None] * (place[second] - place[first])
@@ -325,9 +346,9 @@ def surface_nets(
 
 
 def _keys(cell: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
-    """One integer a lattice point; coordinates must lie within `_SPAN`."""
-    x, y, z = (cell + _SPAN).unbind(-1)
-    return (x * 2 * _SPAN + y) * 2 * _SPAN + z
+    """One integer a lattice point; coordinates must lie within `_MAX_COORDINATE`."""
+    x, y, z = (cell + _MAX_COORDINATE).unbind(-1)
+    return (x * 2 * _MAX_COORDINATE + y) * 2 * _MAX_COORDINATE + z
 
 
 def _components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "count"]:
@@ -356,7 +377,8 @@ def write_mesh(
         write_bytes(path, _glb(mesh, colour, added))
     else:
         faces = np.empty(len(mesh.face), [("vertex_indices", [("count", "u1"), ("corners", "<i4", 3)])])
-        faces["vertex_indices"]["count"], faces["vertex_indices"]["corners"] = 3, mesh.face.numpy()
+        faces["vertex_indices"]["count"] = 3
+        faces["vertex_indices"]["corners"] = mesh.face.numpy()
         rows = np.empty(len(mesh.point), [("real", "<f4", 6), ("shade", "u1", 3)])
         rows["real"] = torch.cat([mesh.point, mesh.normal.double()], 1).float().numpy()
         rows["shade"] = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
@@ -403,7 +425,8 @@ def _glb(mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin) -> bytes:
             "pbrMetallicRoughness": rough,
             "extensions": {"KHR_materials_unlit": {}},
         }
-        tree["materials"], tree["extensionsUsed"] = [material], ["KHR_materials_unlit"]
+        tree["materials"] = [material]
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
         for node in tree["nodes"]:
             if "mesh" in node and any(origin):
                 node["translation"] = list(origin)

@@ -23,14 +23,18 @@ if TYPE_CHECKING:
 
 
 Codec = Literal["h264", "mp4v", "gif", "webp", "apng"]
-_ANIMATIONS: dict[str, tuple[Codec, str, list[int]]] = {
+_ANIMATED_FORMATS: dict[str, tuple[Codec, str, list[int]]] = {
     ".gif": ("gif", ".gif", [cv2.IMWRITE_GIF_QUALITY, 8, cv2.IMWRITE_GIF_DITHER, 1]),
     ".webp": ("webp", ".webp", [cv2.IMWRITE_WEBP_QUALITY, 84]),
     ".apng": ("apng", ".png", []),
 }
 """Animated pictures by ending: their format, the ending that OpenCV knows it by, and its options."""
-FILMS = (".mp4", *_ANIMATIONS)
+FILMS = (".mp4", *_ANIMATED_FORMATS)
 """Endings of the films that can be written."""
+_X264_OPTIONS = {"crf": "17", "preset": "medium"}
+"""Quality of H.264: what the eye takes for the frames themselves."""
+_MAX_RATE_DENOMINATOR = 1001
+"""Denominator of a film's rate: that of 29.97 frames a second."""
 MAX_FPS = 1000
 """Frames per second of a film, at most: animated pictures count whole milliseconds."""
 
@@ -49,18 +53,18 @@ def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
         # 4:2:0 colour needs even sizes: the last row and column are repeated.
         bottom = frame.shape[0] % 2
         right = frame.shape[1] % 2
-        yield (
-            np.pad(checked(frame), ((0, bottom), (0, right), (0, 0)), mode="edge")
-            if bottom or right
-            else checked(frame)
-        )
+        if bottom or right:
+            yield np.pad(checked(frame), ((0, bottom), (0, right), (0, 0)), mode="edge")
+        else:
+            yield checked(frame)
 
 
 def _with_av(
     av: "ModuleType", path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction
 ) -> None:
+    """Write H.264 by PyAV."""
     with av.open(str(path.absolute()), "w", options={"movflags": "+faststart"}) as container:
-        stream = container.add_stream("libx264", rate=fps, options={"crf": "17", "preset": "medium"})
+        stream = container.add_stream("libx264", rate=fps, options=_X264_OPTIONS)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
         # Players take untagged films of more than 576 lines for BT.709 and smaller ones for BT.601: say which
@@ -91,13 +95,13 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         )
     if not 0 < fps <= MAX_FPS:
         raise UsageError(f"{path}: {fps} frames a second; must lie in (0, {MAX_FPS}]")
-    rate = Fraction(fps).limit_denominator(1001)
+    rate = Fraction(fps).limit_denominator(_MAX_RATE_DENOMINATOR)
     even = _alike(frames, path)
     first = next(even, None)
     if first is None:
         raise DataError(f"{path}: no frames to write; the camera path is empty")
     size = (first.shape[1], first.shape[0])
-    if path.suffix.lower() in _ANIMATIONS:
+    if path.suffix.lower() in _ANIMATED_FORMATS:
         return _animated(path, [first, *even], fps)
     # PyAV, unless it is absent or was built without x264, as some distributions do; else OpenCV.
     av = None
@@ -108,30 +112,37 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
         if av is not None and "libx264" in av.codecs_available:
             _with_av(av, temporary, chain([first], even), size, rate)
             return "h264"
-        writer = cv2.VideoWriter(
-            str(temporary.absolute()), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size
-        )
-        if not writer.isOpened():
-            raise DataError(
-                f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder"
-            )
-        count = 0
-        try:
-            for frame in chain([first], even):
-                writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-                count += 1
-        finally:
-            writer.release()
-        # The writer says nothing of a full disk, which leaves a film without its index.
-        found = max(0, int(cv2.VideoCapture(str(temporary.absolute())).get(cv2.CAP_PROP_FRAME_COUNT)))
-        if found < count:
-            raise unwritable(path, OSError(f"{found} of {count} frames are in it"))
+        _with_opencv(path, temporary, chain([first], even), size, rate)
         return "mp4v"
+
+
+def _with_opencv(
+    path: Path, temporary: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction
+) -> None:
+    """Write MPEG-4 part 2 by OpenCV to `temporary`. Raises DataError, which begins with `path`, without an
+    encoder and on a full disk.
+    """
+    writer = cv2.VideoWriter(str(temporary.absolute()), cv2.VideoWriter.fourcc(*"mp4v"), float(fps), size)
+    if not writer.isOpened():
+        raise DataError(
+            f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder"
+        )
+    count = 0
+    try:
+        for frame in frames:
+            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            count += 1
+    finally:
+        writer.release()
+    # The writer says nothing of a full disk, which leaves a film without its index.
+    found = max(0, int(cv2.VideoCapture(str(temporary.absolute())).get(cv2.CAP_PROP_FRAME_COUNT)))
+    if found < count:
+        raise unwritable(path, OSError(f"{found} of {count} frames are in it"))
 
 
 def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
     """Write an animated picture that starts over at its end."""
-    kind, ending, options = _ANIMATIONS[path.suffix.lower()]
+    kind, ending, options = _ANIMATED_FORMATS[path.suffix.lower()]
     film = cv2.Animation()
     film.frames = [cv2.cvtColor(frame, cv2.COLOR_RGB2BGR) for frame in frames]
     # Each duration is a whole number of milliseconds, and of GIF's hundredths: rounded so that no error adds
@@ -148,7 +159,8 @@ def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
     return kind
 
 
-_RECORD = ".render.json"
+_FRAMES_RECORD = ".render.json"
+"""File that says what a folder of frames was rendered from, and their names."""
 
 
 def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
@@ -159,7 +171,7 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     system refuses to write there.
     """
     # What the folder was rendered from, if that can be read, and the frames of it.
-    record = folder / _RECORD
+    record = folder / _FRAMES_RECORD
     try:
         content = parse_json(record.read_text("utf-8"))
         known = content.get("key")

@@ -93,7 +93,7 @@ def test_it_is_the_same_far_from_the_origin(seen: Maps, mesh: Mesh) -> None:
 def test_the_edge_follows_the_pixels_and_the_bound(seen: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
     pixel = torch.cat([depth[depth.isfinite()] for depth in seen.depth]).median() / 50
     assert build_mesh(seen).edge == pytest.approx(2 * float(pixel), rel=1e-6)
-    monkeypatch.setattr("fprf.export.mesh._MOST", 5_000)
+    monkeypatch.setattr("fprf.export.mesh._MAX_LATTICE_POINTS", 5_000)
     assert build_mesh(seen).edge > 3 * float(pixel)
 
 
