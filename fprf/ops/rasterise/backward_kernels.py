@@ -56,7 +56,6 @@ CAMERA = 6
 """Degrees of freedom of a camera."""
 _LOG_MAX = math.log2(MAX_ALPHA)
 """log2 alpha above which it is cut."""
-_FIRST_DECAY, _SECOND_DECAY = ADAM_DECAYS
 _BLOCK_SUMS = SUMS * LANES
 
 
@@ -365,7 +364,7 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
     at = start * (FIXED + 3 * bands)
     # Adam, whose second moment is weighted by how often a Gaussian was seen.
     w = load(weight, start)
-    w = w + (1 - _SECOND_DECAY) * (1 - w)
+    w = w + (1 - ADAM_DECAYS[1]) * (1 - w)
     store(weight, start, w)
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
     rows, of_view = _block_gradient(blocks, at, bands, view, [*summed, 0])
@@ -375,8 +374,8 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
         o = at + row * LANES
         m = load(first, o)
         s = load(second, o)
-        m = m + (1 - _FIRST_DECAY) * (g - m)
-        s = s + (1 - _SECOND_DECAY) * (g * g - s)
+        m = m + (1 - ADAM_DECAYS[0]) * (g - m)
+        s = s + (1 - ADAM_DECAYS[1]) * (g * g - s)
         store(first, o, m)
         store(second, o, s)
         store(blocks, o, load(blocks, o) - rates[row] * m / (square_root(s / w) + ADAM_EPSILON))

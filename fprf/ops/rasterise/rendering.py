@@ -41,7 +41,7 @@ _Array = np.ndarray[Any, Any]
 _SKIPPED = ("faint", "behind", "outside", "invalid")
 _WIDE = 8
 """Feature channels that the kernels composite at once."""
-_MIN_OPACITY = 1e-6
+_MIN_PIXEL_OPACITY = 1e-6
 """Of a pixel, below which its depth is 0: a drawn alpha is at least 1/255."""
 
 
@@ -102,7 +102,7 @@ def rasterise(
         )
     # The mean depth by weight.
     opacity = 1 - passing
-    depth = planes[..., 3] / opacity.clamp_min(_MIN_OPACITY)
+    depth = planes[..., 3] / opacity.clamp_min(_MIN_PIXEL_OPACITY)
     return Rasterised(planes[..., :3], depth, opacity, planes[..., 4:], counts)
 
 
