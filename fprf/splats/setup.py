@@ -29,7 +29,7 @@ from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig
 from .initial import Points, initial_points, projected, surroundings
-from .learner import CPU, Bounds, GaussianLearner, LimitWidths, Source
+from .learner import CPU, Bounds, GaussianLearner, LimitWidths, RunSource
 from .photographs import load_photographs, make_levels
 from .view_corrections import ViewCorrections
 
@@ -112,7 +112,7 @@ def build(
             limit_widths=limit_widths(scene, near, cells=config.cells > 1, sphere=sphere),
         ),
         corrections=ViewCorrections(tones_of(facts), poses_of(facts, 1.0)),
-        source=Source(known=known_of(scene, config.data, facts), points=origin),
+        source=RunSource(known=known_of(scene, config.data, facts), points=origin),
         device=device,
     )
     learner.begin_at(points, draw, far)
