@@ -145,12 +145,12 @@ class Restyler:
 
     def retain(self, photographs: Collection[Photograph]) -> None:
         """Drop what is kept for any other photograph."""
-        self._dictionaries = {
-            key: value for key, value in self._dictionaries.items() if key[0] in photographs
-        }
-        self._styles = {
-            look: value for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs}
-        }
+        for key in [*self._dictionaries]:
+            if key[0] not in photographs:
+                del self._dictionaries[key]
+        for look in [*self._styles]:
+            if not {*dict(look.mix)} <= {*photographs}:
+                del self._styles[look]
 
     def restyle(self, look: Look) -> Restyle | None:
         """The look for a renderer."""

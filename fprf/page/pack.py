@@ -119,7 +119,8 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     words[:, 3] = (
         size[:, 0] | size[:, 1] << 8 | size[:, 2] << 16 | steps(gaussians.opacities.numpy(), 255) << 24
     )
-    chunks = np.concatenate([each for pair in ranges for each in pair], 1).astype(np.float32)
+    (low_mean, high_mean), (low_size, high_size) = ranges
+    chunks = np.concatenate([low_mean, high_mean, low_size, high_size], 1).astype(np.float32)
     return Packed(order, harmonics, words.view(np.uint8), chunks, palette, largest)
 
 

@@ -64,6 +64,8 @@ _MAX_QUERY_FIELDS = 16
 """Fields of an address; the page sends four."""
 _SENT_BYTES = 1 << 16
 """Bytes of a piece of a response, which has to be accepted in time."""
+_LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
+"""Scripts of the served page, beside those of every page."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -316,7 +318,8 @@ class ViewerServer:
     def __exit__(self, *_: object) -> None:
         self._close_session()
         # Open WebSockets would hold an orderly end up for ever.
-        self._server.force_exit = self._server.should_exit = True
+        self._server.force_exit = True
+        self._server.should_exit = True
         self._thread.join(5)
 
     @property
@@ -410,9 +413,7 @@ class ViewerServer:
         page = Template(read_asset("live.html")).substitute(stage=stage)
         return [
             Route("/", _asset("text/html", lambda: page)),
-            Route(
-                "/app.js", _asset("text/javascript", lambda: script("live.js", "start.js") + "\nlive();\n")
-            ),
+            Route("/app.js", _asset("text/javascript", lambda: script(*_LIVE_SCRIPTS) + "\nlive();\n")),
             Route("/app.css", _asset("text/css", lambda: read_asset("page.css") + read_asset("live.css"))),
             WebSocketRoute("/live", self._live),
             Route("/scene", self._scene),

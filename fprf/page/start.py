@@ -308,32 +308,29 @@ class Start:
         last = asked.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
         plain = "".join(c if c.isalnum() or c in "-_" else "-" for c in last)[:40].strip("-") or "scene"
         # A number is added until no folder and no upload has the name.
-        names = (plain if k == 1 else f"{plain}-{k}" for k in count(1))
-        return next(
-            name for name in names if name not in self._uploads and not (self._output / name).exists()
-        )
+        name = plain
+        for number in count(2):
+            if name not in self._uploads and not (self._output / name).exists():
+                break
+            name = f"{plain}-{number}"
+        return name
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
         # Runs of the terminal lie in `runs`, that of the demo in its folder.
-        runs = [
-            (path.parent, path.parent.name)
-            for path in Path("runs").glob("*/config.json")
-            if newest_step(path.parent) >= 0
-        ]
-        found = [*runs, (Path("demo/run"), "demo")]
-        for folder in self._output.glob(
-            "*/"
-        ):  # a scene's run, and its files where training has not come to its end
+        found = [(Path("demo/run"), "demo")]
+        for path in Path("runs").glob("*/config.json"):
+            if newest_step(path.parent) >= 0:
+                found.append((path.parent, path.parent.name))
+        # A scene's run, and its files where training has not come to its end.
+        for folder in self._output.glob("*/"):
             run = folder / _RUN_FOLDER
             files = folder / _FILES_FOLDER
             scene = folder / _SCENE_FOLDER
             trained = newest_step(run) >= 0
+            progress: dict[str, Any] | None = {"share": 0}
             if trained:
                 progress = training_progress(run)
-            else:
-                progress = {"share": 0}
-            if trained:
                 found.append((run, folder.name))
             if progress is not None and progress["share"] < 1:
                 found.append((scene if trained and not files.is_dir() else files, folder.name))

@@ -82,9 +82,8 @@ class Look:
     def mixed(self, mix: Iterable[tuple[Photograph, float]]) -> "Look":
         """The look with other photographs; rules that name a photograph that is not among them go."""
         mix = tuple(mix)
-        rules = frozenset(
-            rule for rule in self.rules if rule.photograph is None or rule.photograph in dict(mix)
-        )
+        kept = {None, *dict(mix)}
+        rules = frozenset(rule for rule in self.rules if rule.photograph in kept)
         return replace(self, mix=mix, rules=rules)
 
     def weighted(self, photograph: Photograph, weight: float, shelf: Iterable[Photograph]) -> "Look":
@@ -204,7 +203,10 @@ class SharedState:
     @property
     def in_use(self) -> frozenset[Photograph]:
         """Photographs that some look needs."""
-        return frozenset(photograph for look in self.looks for photograph, _ in look.mix)
+        used: set[Photograph] = set()
+        for look in self.looks:
+            used.update(dict(look.mix))
+        return frozenset(used)
 
     def renumbered(self, regions: Sequence[int]) -> "SharedState":
         """With region r as regions[r] in the rules of all looks; none is picked: regions were measured

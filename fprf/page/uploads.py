@@ -129,7 +129,8 @@ class Uploads:
             self._process.join()
             self._process.close()
             self._pipe.close()
-        self._process = self._pipe = None
+        self._process = None
+        self._pipe = None
 
 
 def limit_memory(room: int) -> None:
@@ -212,9 +213,9 @@ def _kinds() -> str:
 
 def is_capture(path: Path) -> bool:
     """True for a path that is named like a capture of 3D Gaussians."""
-    return format_name(path) is not None or any(
-        (path / name).is_file() for name in ("meta.json", "lod-meta.json")
-    )
+    if format_name(path) is not None:
+        return True
+    return (path / "meta.json").is_file() or (path / "lod-meta.json").is_file()
 
 
 def newest_step(run: Path) -> int:
@@ -328,12 +329,20 @@ def check_file(name: str, head: bytes, size: int) -> None:
         raise DataError(f"{name}: damaged, or no {suffix} file; export it again")
 
 
+def _is_plain(part: str) -> bool:
+    """True for a part of a path that is a plain name on every system."""
+    if not part.isprintable() or part.startswith("."):
+        return False
+    return not {*part} & {*'\\:*?"<>|'} and len(part) <= _MAX_PART_CHARACTERS
+
+
 class SceneFiles:
     """Receives the files of one scene into `folder`, which is made with the first of them."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._files = self._bytes = 0
+        self._files = 0
+        self._bytes = 0
         self._lock = threading.Lock()
 
     def add(self, name: str, at: int, size: int, data: bytes) -> None:
@@ -344,13 +353,7 @@ class SceneFiles:
         """
         # The name leads to a place below the folder, by parts that are plain names on every system.
         parts = PurePosixPath(name).parts
-        plain = all(
-            part.isprintable()
-            and not part.startswith(".")
-            and not {*part} & {*'\\:*?"<>|'}
-            and len(part) <= _MAX_PART_CHARACTERS
-            for part in parts
-        )
+        plain = all(_is_plain(part) for part in parts)
         if not parts or not plain or name.startswith("/") or len(parts) > _MAX_FOLDER_DEPTH:
             raise UsageError(f"{name[:80]!r}: no name of a file in a folder; rename it")
         path = self.folder.joinpath(*parts)

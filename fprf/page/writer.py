@@ -281,6 +281,13 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     facts = ((name, fact if isinstance(fact, str) else f"{fact:,}") for name, fact in page.facts.items())
     rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts)
     present = [(name, part) for name, part in below if part]
+    body = []
+    for name, part in present:
+        body.append(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>')
+    scripts = []
+    for name, packed in parts.items():
+        text = base64.b64encode(packed).decode()
+        scripts.append(f'<script type="text/plain" id="data-{name}">{text}</script>')
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
     return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
@@ -293,16 +300,11 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
             ratio=f'style="--ratio:{width / height:.4f}"',
             facts=f'<dl class="facts">{rows}</dl>' if rows else "",
         ),
-        body="\n".join(
-            f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present
-        ),
+        body="\n".join(body),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),
         # "<" cannot end the script then, whatever a name holds.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
-        sections="\n".join(
-            f'<script type="text/plain" id="data-{name}">{base64.b64encode(part).decode()}</script>'
-            for name, part in parts.items()
-        ),
+        sections="\n".join(scripts),
         script=code,
     )
 
@@ -316,12 +318,13 @@ def _img(picture: Picture, side: int, alt: str) -> str:
 
 def _views(views: Sequence[PageView]) -> str:
     """Photographs beside what the scene shows from their places."""
-    rows = "".join(
-        f'<figure><div class="pair">{_img(view.photograph, _VIEW_PIXELS, f"Photograph {view.name}")}'
-        f"{_img(view.original, _VIEW_PIXELS, f'View {view.name}')}</div><figcaption>{escape(view.name)}</figcaption></figure>"
-        for view in views
-        if view.photograph is not None
-    )
+    rows = ""
+    for view in views:
+        if view.photograph is not None:
+            photograph = _img(view.photograph, _VIEW_PIXELS, f"Photograph {view.name}")
+            shown = _img(view.original, _VIEW_PIXELS, f"View {view.name}")
+            caption = f"<figcaption>{escape(view.name)}</figcaption>"
+            rows += f'<figure><div class="pair">{photograph}{shown}</div>{caption}</figure>'
     lead = "Photographs that training did not see, and beside them the scene."
     return f'<p class="lead">{lead}</p><div class="grid">{rows}</div>'
 
@@ -348,10 +351,10 @@ def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Referenc
         rows.append(
             f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>"
         )
-    maps = "".join(
-        f"<figure>{_img(each, _MATCH_MAP_PIXELS, view.name)}<figcaption>{escape(view.name)}</figcaption></figure>"
-        for view, each in zip(views, style.matches, strict=False)
-    )
+    maps = ""
+    for view, each in zip(views, style.matches, strict=False):
+        image = _img(each, _MATCH_MAP_PIXELS, view.name)
+        maps += f"<figure>{image}<figcaption>{escape(view.name)}</figcaption></figure>"
     return f"""<article class="style"><h3>{escape(style.name)}</h3>
 <div class="sources">{"".join(rows)}</div>
 {f'<p class="lead">Which reference each place took its style from</p><div class="grid small">{maps}</div>' if maps else ""}

@@ -126,7 +126,9 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
         for part in (slice(step, None), slice(None, -step)):
             left = apart
             for row in near[:, part]:
-                row[:], left = np.minimum(row, left), np.maximum(row, left)
+                farther = np.maximum(row, left)
+                row[:] = np.minimum(row, left)
+                left = farther
     mean = np.empty(count)
     mean[order] = near.mean(0)
     widest = np.percentile(mean, 99) or 1.0
@@ -203,12 +205,12 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     colours = [np.zeros((0, 3), np.float32)]
     done = set()
     for i in features:
-        apart = {
-            j: np.linalg.norm(centre[j] - centre[i]) / spread + 2 * (1 - axis[i] @ axis[j])
-            for j in features
-            if j != i
-        }
-        for j in sorted(apart, key=lambda j: float(apart[j]))[:_MAX_MATCHED_VIEWS]:
+        apart: dict[int, float] = {}
+        for j in features:
+            if j != i:
+                between = np.linalg.norm(centre[j] - centre[i]) / spread
+                apart[j] = float(between + 2 * (1 - axis[i] @ axis[j]))
+        for j in sorted(apart, key=apart.__getitem__)[:_MAX_MATCHED_VIEWS]:
             if (j, i) in done:
                 continue
             done.add((i, j))

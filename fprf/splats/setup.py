@@ -166,10 +166,8 @@ def limit_widths(
     `near` is drawn.
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
-    if cells:
-        share, every = (_MAX_WIDTH_IN_CELLS, _WIDTH_EVERY_STEPS_IN_CELLS)
-    else:
-        share, every = (_MAX_WIDTH, _WIDTH_EVERY_STEPS)
+    share = _MAX_WIDTH_IN_CELLS if cells else _MAX_WIDTH
+    every = _WIDTH_EVERY_STEPS_IN_CELLS if cells else _WIDTH_EVERY_STEPS
 
     def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
