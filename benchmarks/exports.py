@@ -26,7 +26,7 @@ from fprf.rendering.paths import pinhole
 from fprf.scenes import Scene
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle

@@ -41,7 +41,7 @@ from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.splats.scene import SplatScene
 from fprf.training.loading import open_run
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from fprf.page.messages import Camera
-from fprf.page.state import Key, Look
+from fprf.page.state import Look, PageKeyframe
 from fprf.scenes import Scene
-from fprf.splats.photographs import camera_of as pinhole_of
+from fprf.splats.pinholes import camera_of as pinhole_of
 
 
 def camera_of(scene: Scene, view: int) -> Camera:
@@ -25,9 +25,9 @@ def camera_of(scene: Scene, view: int) -> Camera:
     return Camera(place=place, axes=axes, lens=numbers, size=(float(camera.width), float(camera.height)))
 
 
-def keys_of(scene: Scene, looks: Iterable[Look]) -> tuple[Key, ...]:
+def keys_of(scene: Scene, looks: Iterable[Look]) -> tuple[PageKeyframe, ...]:
     """Keyframes at captured views."""
-    return tuple(Key(camera_of(scene, view), look) for view, look in enumerate(looks))
+    return tuple(PageKeyframe(camera_of(scene, view), look) for view, look in enumerate(looks))
 
 
 def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) -> None:

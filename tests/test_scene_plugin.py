@@ -15,7 +15,7 @@ import fprf
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_image
 from fprf.io.images import to_uint8
-from fprf.page.messages import View
+from fprf.page.messages import ViewRequest
 from fprf.page.session import Session, view_of_run
 from fprf.training.loading import open_run
 from fprf.training.quality import QualityConfig
@@ -33,7 +33,7 @@ from fprf.interfaces import Figures, State
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import grid_rays
 from fprf.scenes import Scene, SceneLearner, SceneView
-from fprf.splats.restyle import Colours
+from fprf.splats.restyle import ColourEncoder
 from fprf.style.dictionary import Encoders
 from fprf.style.scene_style import scene_style
 from fprf.training import checkpoint
@@ -149,7 +149,7 @@ class PlaneScene(Scene):
         return scene_style(colour, self.semantic(colour), torch.ones(len(colour)), None, 3, 0), basis
 
     def encoders(self):
-        return Encoders(Colours(), self.encoder, self.measured()[1], self.measured()[0], longest=64)
+        return Encoders(ColourEncoder(), self.encoder, self.measured()[1], self.measured()[0], longest=64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +235,7 @@ def test_every_verb_takes_a_kind_of_scene_from_another_package(
     client = Listener()
     with Session(replace(view_of_run(opened), pixels=32), client.post) as session:
         session.upload(world.references[0].read_bytes(), "dusk")
-        session.handle("browser", View(camera=camera_of(opened.scene, 0), captured=True))
+        session.handle("browser", ViewRequest(camera=camera_of(opened.scene, 0), captured=True))
         client.until(lambda: len(client.pictures("browser", "captured")) == 2)
     captured = to_uint8(opened.scene.render(opened.scene.cameras, 0).rgb).astype(float)
     assert abs(client.pictures("browser", "captured")[-1][..., ::-1] - captured).mean() < 3, "JPEG"

@@ -2,8 +2,8 @@
 (`fprf view`).
 
 - What browsers run: `web/` (`splats.js` draws, `place.js` moves, `page.js` has the controls: every page has
-  these, `stage.html` and `page.css`; `page.html` is the file that one sends; `live.*`, `panel.html`,
-  `start.js` are the served page).
+  these, `stage.html` and `page.css`; `page.html` is the file that one sends; `live.*`, `panel.*`, `field.js`,
+  `photographs.js`, `start.js` are the served page).
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
 - Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`,
   `start.py`.

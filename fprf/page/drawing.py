@@ -39,34 +39,35 @@ from ..style.matching import unit
 from ..style.regions import memberships
 from ..style.restyle import Styled, apply_dictionary, keyed_looks
 from ..style.scene_style import RegionWeight, SceneStyle
-from .messages import Camera, View
+from .messages import Camera, ViewRequest
 from .pack import Colours, Packed
 from .render_worker import Steps
-from .state import Key, Look, Photograph, RegionInfo, Shown
+from .state import Look, PageKeyframe, Photograph, RegionInfo, Shown
 
 K = TypeVar("K")
 V = TypeVar("V")
-_THUMBNAIL = 128
-"""Longest side in pixels."""
-_CACHED = 24
-"""Dictionaries and styles that are kept for when somebody returns to them."""
-_SOLID = 0.01
-"""Opacity below which there is nothing to point at."""
+_THUMBNAIL_PIXELS = 128
+"""Longest side of a photograph on the shelf; by eye."""
+_MAX_KEPT_STYLES = 24
+"""Dictionaries and styles that are kept for when somebody returns to them; by eye."""
+_MIN_POINTED_OPACITY = 0.01
+"""Opacity below which there is nothing to point at; by eye."""
 CACHE_BYTES = 128 << 20
-"""Features that are kept of each client's last view."""
+"""Bytes of features that are kept of each client's last view; by eye."""
 STRIP = 4096
-"""Pixels of a step, or those of one row: after each one a newer request may take over."""
-_PREVIEW = 6
-"""Factor by which the first picture of a new camera is smaller."""
-_MIN_CANVAS = 8
-_MAX_CANVAS = 4096
-"""Longer sides of pictures, in pixels."""
-_NO_MATCH = 0.5
+"""Pixels of a step, or those of one row: after each one a newer request may take over; by eye."""
+_PREVIEW_REDUCTION = 6
+"""Factor by which the first picture of a new camera is smaller; by eye."""
+_MIN_CANVAS_PIXELS = 8
+"""Longer side of a picture, at least, whatever a client asks for."""
+_MAX_CANVAS_PIXELS = 4096
+"""Longer side of a picture, at most."""
+_UNMATCHED_GREY = 0.5
 """Grey of the map of matches without a style."""
-_DIM = 0.45
-"""Brightness of what does not belong to the region that is picked; it is grey, too."""
-_UNSURE = 0.45
-"""Brightness of a region's colour where a pixel belongs to many."""
+_DIMMED_BRIGHTNESS = 0.45
+"""Brightness of what does not belong to the region that is picked; it is grey, too; by eye."""
+_MIXED_BRIGHTNESS = 0.45
+"""Brightness of a region's colour where a pixel belongs to many; by eye."""
 
 
 class Restyler:
@@ -106,7 +107,8 @@ class Restyler:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(path, self.encoders, name=name)
         self._photographs += 1
-        return Photograph(self._photographs, name, path, load_preview(path, _THUMBNAIL), reference)
+        thumbnail = load_preview(path, _THUMBNAIL_PIXELS)
+        return Photograph(self._photographs, name, path, thumbnail, reference)
 
     def styled(self, look: Look) -> Styled | None:
         """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict
@@ -138,12 +140,12 @@ class Restyler:
 
     def retain(self, photographs: Collection[Photograph]) -> None:
         """Drop what is kept for any other photograph."""
-        self._dictionaries = {
-            key: value for key, value in self._dictionaries.items() if key[0] in photographs
-        }
-        self._styles = {
-            look: value for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs}
-        }
+        for key in [*self._dictionaries]:
+            if key[0] not in photographs:
+                del self._dictionaries[key]
+        for look in [*self._styles]:
+            if not {*dict(look.mix)} <= {*photographs}:
+                del self._styles[look]
 
     def restyle(self, look: Look) -> Restyle | None:
         """The look for a renderer."""
@@ -157,7 +159,7 @@ class Restyler:
         # The region of the pixel's strongest membership, by the features that the ray sees.
         place = torch.tensor([pixel], dtype=torch.float64)
         share, opacity = memberships(self.scene, self.encoders.scene_style, cameras, 0, place)
-        if float(opacity[0]) >= _SOLID:
+        if float(opacity[0]) >= _MIN_POINTED_OPACITY:
             return int(share[0].argmax())
         return None
 
@@ -181,7 +183,7 @@ class Restyler:
 def _recalled(cache: dict[K, V], key: K, make: Callable[[], V]) -> V:
     """Return what is kept under a key, or make it; it becomes the last to be dropped."""
     cache[key] = cache.pop(key) if key in cache else make()
-    while len(cache) > _CACHED:
+    while len(cache) > _MAX_KEPT_STYLES:
         del cache[next(iter(cache))]
     return cache[key]
 
@@ -226,7 +228,7 @@ def _mapped(
     """
     if shown.map == "matches":
         if styled is None:
-            colours = torch.full((len(opacity), 3), _NO_MATCH)
+            colours = torch.full((len(opacity), 3), _UNMATCHED_GREY)
         else:
             # Colours of the references, by what is taken of each code. The rest is what the look leaves as it
             # is.
@@ -243,10 +245,13 @@ def _mapped(
     if shown.map == "regions":
         # A region's colour is dimmed where a point belongs to many.
         most, region = share.max(-1)
-        colours = palette(share.shape[1])[region] * ((_UNSURE + (1 - _UNSURE) * most) * opacity)[:, None]
+        colours = (
+            palette(share.shape[1])[region]
+            * ((_MIXED_BRIGHTNESS + (1 - _MIXED_BRIGHTNESS) * most) * opacity)[:, None]
+        )
     if shown.region is None:
         return colours
-    grey = _DIM * colours.mean(-1, keepdim=True)
+    grey = _DIMMED_BRIGHTNESS * colours.mean(-1, keepdim=True)
     return grey + (colours - grey) * share[:, shown.region, None]
 
 
@@ -280,7 +285,7 @@ class ScenePainter:
         """Drop what is kept for a client."""
         self._views.pop(client, None)
 
-    def render(self, client: Hashable, request: View, shown: Shown) -> Steps[None]:
+    def render(self, client: Hashable, request: ViewRequest, shown: Shown) -> Steps[None]:
         """Show a small picture of a new camera, then the whole one, a step each strip."""
         kept = self._views.get(client)
         if kept is not None and kept[0] != request.camera:
@@ -289,7 +294,7 @@ class ScenePainter:
         styled = self._restyler.styled(shown.look)
         full = cameras_of([request.camera], longest=self._longest)
         width, height = full.size[0].tolist()
-        small = (max(1, round(width / _PREVIEW)), max(1, round(height / _PREVIEW)))
+        small = (max(1, round(width / _PREVIEW_REDUCTION)), max(1, round(height / _PREVIEW_REDUCTION)))
         for size in [(width, height)] if kept else [small, (width, height)]:
             rows: list[Tensor] = []
             captured: list[Tensor] = []
@@ -341,7 +346,7 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
     """
     if size is None:
         width, height = cameras[0].size
-        by = max(_MIN_CANVAS, min(longest, _MAX_CANVAS)) / max(width, height)
+        by = max(_MIN_CANVAS_PIXELS, min(longest, _MAX_CANVAS_PIXELS)) / max(width, height)
         size = (max(1, round(width * by)), max(1, round(height * by)))
     poses = []
     focal = []
@@ -368,9 +373,11 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
 
 
 FPS = 24.0
+"""Frames a second of a film."""
 FILM_SIDE = 960
-"""Frames a second of a film, and its longest side in pixels."""
-_MAX_SECONDS = 600.0
+"""Longest side of a film in pixels; by eye."""
+_MAX_FILM_SECONDS = 600.0
+"""Length of a film that is made from the page, at most: `fprf render` makes longer ones."""
 
 
 def film_gap(seconds: float) -> int:
@@ -378,7 +385,7 @@ def film_gap(seconds: float) -> int:
     return max(1, round(seconds * FPS))
 
 
-def film_cameras(keys: Sequence[Key], seconds: float, side: int = FILM_SIDE) -> Cameras:
+def film_cameras(keys: Sequence[PageKeyframe], seconds: float, side: int = FILM_SIDE) -> Cameras:
     """A camera each frame, of even sizes in the shape of the first key's canvas; a single key is one frame.
 
     Raises UsageError for no keys or a film that is too long.
@@ -386,8 +393,8 @@ def film_cameras(keys: Sequence[Key], seconds: float, side: int = FILM_SIDE) -> 
     if not keys:
         raise UsageError("film: no keys yet; go somewhere and add one")
     length = seconds * (len(keys) - 1)
-    if length > _MAX_SECONDS:
-        raise UsageError(f"film: {length:.0f} s; at most {_MAX_SECONDS:.0f} s are filmed from the page")
+    if length > _MAX_FILM_SECONDS:
+        raise UsageError(f"film: {length:.0f} s; at most {_MAX_FILM_SECONDS:.0f} s are filmed from the page")
     width, height = keys[0].camera.size
     by = side / max(width, height) / 2
     size = (max(2, 2 * round(width * by)), max(2, 2 * round(height * by)))
@@ -396,7 +403,7 @@ def film_cameras(keys: Sequence[Key], seconds: float, side: int = FILM_SIDE) -> 
 
 
 def write_film_files(
-    folder: Path, keys: Sequence[Key], seconds: float, scene: Scene, side: int = FILM_SIDE
+    folder: Path, keys: Sequence[PageKeyframe], seconds: float, scene: Scene, side: int = FILM_SIDE
 ) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs; the folder is
     made.

@@ -42,7 +42,7 @@ class Message(Struct, tag=True, forbid_unknown_fields=True):
     """A message."""
 
 
-class View(Message, tag="view"):
+class ViewRequest(Message, tag="view"):
     """A camera has moved, of a scene that is drawn here; with `captured` the scene as captured is shown
     beside the look.
     """
@@ -116,7 +116,7 @@ class Film(Message, tag="film"):
 
 Change: TypeAlias = Set | Preset | Card | Region | Map | Keep | Key
 """Messages that change what all clients see."""
-AnyMessage: TypeAlias = View | Pick | Film | Change
+AnyMessage: TypeAlias = ViewRequest | Pick | Film | Change
 
 Minutes: TypeAlias = Annotated[float, Meta(ge=0.05, le=600)]
 

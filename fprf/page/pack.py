@@ -35,12 +35,13 @@ CHUNK = 256
 """Gaussians of a chunk; the last one is filled up with its last Gaussian."""
 MAPS = 256
 """Matrices a style, at most."""
-_HARMONICS = 9
+_PAGE_HARMONICS = 9
 """Harmonics a channel that the page evaluates: degree 2."""
-_LLOYD = 6
-_SAMPLE = 1 << 14
-"""Rows that a palette is learned from, at most."""
-_BLOCK = 1 << 15
+_LLOYD_ROUNDS = 6
+"""Rounds of Lloyd's algorithm that a palette is learned in; by eye."""
+_MAX_PALETTE_ROWS = 1 << 14
+"""Rows that a palette is learned from, at most; by eye: bounds the time."""
+_COMPARED_ROWS = 1 << 15
 """Rows at a time where each is compared with a palette: bounds the memory."""
 
 
@@ -74,7 +75,7 @@ class Packed:
         `rounds` of fitting its maps: fewer for one that is shown at once, and soon replaced.
         """
         # Means between the least and the most of the style, 8 bits a channel.
-        styled = harmonics[self.order, :_HARMONICS]
+        styled = harmonics[self.order, :_PAGE_HARMONICS]
         mean = (0.5 + HARMONIC * styled[:, 0]).clamp(-1, 2).numpy()
         low = mean.min(0)
         high = mean.max(0)
@@ -109,7 +110,7 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     place, size = parts
     left_out, three = smallest_three(gaussians.quaternions.numpy())
     turn = steps(three / 2 + 0.5, 1023)
-    harmonics = gaussians.harmonics[:, :_HARMONICS]
+    harmonics = gaussians.harmonics[:, :_PAGE_HARMONICS]
     palette, label, largest = _palette(harmonics[:, 1:], entries)
     words = np.zeros((count, 4), "<u4")
     words[:, 0] = place[:, 0] | place[:, 1] << 16
@@ -118,7 +119,8 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     words[:, 3] = (
         size[:, 0] | size[:, 1] << 8 | size[:, 2] << 16 | steps(gaussians.opacities.numpy(), 255) << 24
     )
-    chunks = np.concatenate([each for pair in ranges for each in pair], 1).astype(np.float32)
+    (low_mean, high_mean), (low_size, high_size) = ranges
+    chunks = np.concatenate([low_mean, high_mean, low_size, high_size], 1).astype(np.float32)
     return Packed(order, harmonics, words.view(np.uint8), chunks, palette, largest)
 
 
@@ -161,9 +163,9 @@ def _clustered(
     rows: Annotated[Tensor, "N D"], count: int
 ) -> tuple[Annotated[Tensor, "k D"], Annotated[Tensor, "N"]]:
     """At most `count` means of a sample of the rows (Lloyd's algorithm), and the nearest one of each row."""
-    sample = rows[:: max(1, len(rows) // _SAMPLE)]
+    sample = rows[:: max(1, len(rows) // _MAX_PALETTE_ROWS)]
     book = sample[torch.linspace(0, len(sample) - 1, min(count, len(sample))).long()]
-    for _ in range(_LLOYD):
+    for _ in range(_LLOYD_ROUNDS):
         nearest = _nearest(sample, book)
         # An entry that nothing is nearest to stays where it is.
         inside = torch.bincount(nearest, minlength=len(book))
@@ -175,7 +177,7 @@ def _clustered(
 def _nearest(rows: Annotated[Tensor, "N D"], book: Annotated[Tensor, "E D"]) -> Annotated[Tensor, "N"]:
     """The nearest entry of each row."""
     half = book.square().sum(1) / 2
-    return torch.cat([(half - part @ book.T).argmin(1) for part in torch.split(rows, _BLOCK)])
+    return torch.cat([(half - part @ book.T).argmin(1) for part in torch.split(rows, _COMPARED_ROWS)])
 
 
 def fit_maps(
@@ -204,7 +206,7 @@ def fit_maps(
     for step in range(rounds + 1):
         # Assign each row to the map of the least error, then solve each map's normal equations over its rows.
         book = torch.cat([(maps @ maps.transpose(1, 2)).flatten(1), maps.flatten(1)], 1)
-        label = torch.cat([(part @ book.T).argmin(1) for part in torch.split(rows, _BLOCK)])
+        label = torch.cat([(part @ book.T).argmin(1) for part in torch.split(rows, _COMPARED_ROWS)])
         if step == rounds:
             break
         gram = torch.zeros(len(maps), 9).index_add_(0, label, grams).view(-1, 3, 3)

@@ -6,17 +6,32 @@ queue, however fast a camera moves.
 """
 
 import contextlib
+import enum
 import threading
 from collections.abc import Callable, Generator, Hashable
 from concurrent.futures import CancelledError, Future
 from functools import partial
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from ..errors import UsageError
 
 T = TypeVar("T")
 Steps: TypeAlias = Generator[None, None, T]
-_JOB, _CLIENT, _IDLE = range(3)
+
+
+class _Order(enum.IntEnum):
+    """Which work is done first."""
+
+    JOB = 0
+    CLIENT = 1
+    IDLE = 2
+
+
+class _Work(NamedTuple):
+    """Steps, and what becomes of them."""
+
+    steps: Steps[Any]
+    done: Future[Any]
 
 
 class RenderWorker:
@@ -25,9 +40,8 @@ class RenderWorker:
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
         self._on_error = on_error
         self._change = threading.Condition()
-        # Steps by their order and name, with what becomes of them; among those of the same order the first
-        # one is next.
-        self._work: dict[tuple[int, Hashable], tuple[Steps[Any], Future[Any]]] = {}
+        # Work by its order and name; among that of the same order the first one is next.
+        self._work: dict[tuple[_Order, Hashable], _Work] = {}
         self._dropped: list[Steps[Any]] = []
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="fprf-render", daemon=True)
@@ -37,32 +51,32 @@ class RenderWorker:
 
     def draw(self, client: Hashable, steps: Steps[None]) -> None:
         """Advance a client's picture, in the place of the one before, in turn with those of other clients."""
-        self._add((_CLIENT, client), steps).add_done_callback(self._report)
+        self._add((_Order.CLIENT, client), steps).add_done_callback(self._report)
 
     def run(self, name: Hashable, job: Callable[[], object]) -> None:
         """Run something short before the next step, in the place of a waiting job of the same name."""
-        self._add((_JOB, name), _once(job)).add_done_callback(self._report)
+        self._add((_Order.JOB, name), _once(job)).add_done_callback(self._report)
 
     def run_when_idle(self, steps: Steps[None]) -> None:
         """Advance `steps` while no client waits; work for idle times is done in its order."""
-        self._add((_IDLE, object()), steps).add_done_callback(self._report)
+        self._add((_Order.IDLE, object()), steps).add_done_callback(self._report)
 
     def result(self, job: Callable[[], T]) -> T:
         """Run a job from another thread and return its result. Raises what it raises, UsageError where the
         viewer ends.
         """
-        return self._wait(self._add((_JOB, object()), _once(job)))
+        return self._wait(self._add((_Order.JOB, object()), _once(job)))
 
     def result_when_idle(self, steps: Steps[T]) -> T:
         """Advance `steps` while no client waits, from another thread, and return their result. Raises as
         `result`.
         """
-        return self._wait(self._add((_IDLE, object()), steps))
+        return self._wait(self._add((_Order.IDLE, object()), steps))
 
     def forget(self, client: Hashable) -> None:
         """Drop the picture of a client that has disconnected."""
         with self._change:
-            self._drop((_CLIENT, client))
+            self._drop((_Order.CLIENT, client))
 
     def close(self, timeout: float = 5.0) -> None:
         """Stop after the current step and drop the rest."""
@@ -74,23 +88,23 @@ class RenderWorker:
         if self._thread.is_alive():
             self._thread.join(timeout)
 
-    def _add(self, key: tuple[int, Hashable], steps: Steps[T]) -> "Future[T]":
+    def _add(self, key: tuple[_Order, Hashable], steps: Steps[T]) -> "Future[T]":
         done: Future[T] = Future()
         with self._change:
             self._drop(key)
-            self._work[key] = steps, done
+            self._work[key] = _Work(steps, done)
             if self._closed:
                 self._drop(key)
             self._change.notify()
         return done
 
-    def _drop(self, key: tuple[int, Hashable]) -> None:
+    def _drop(self, key: tuple[_Order, Hashable]) -> None:
         """Take work out; its generator is closed by the thread that ran it, for it may be in the middle of a
         step.
         """
         if (work := self._work.pop(key, None)) is not None:
-            self._dropped.append(work[0])
-            work[1].cancel()
+            self._dropped.append(work.steps)
+            work.done.cancel()
             self._change.notify()
 
     def _run(self) -> None:
@@ -119,12 +133,12 @@ class RenderWorker:
                 if done.cancelled():  # newer work has its place
                     continue
                 # What is over goes, a client goes to the back, and work for idle times stays in front.
-                if outcome is not None or key[0] == _CLIENT:
+                if outcome is not None or key[0] == _Order.CLIENT:
                     del self._work[key]
                 if outcome is not None:
                     outcome()
-                elif key[0] == _CLIENT:
-                    self._work[key] = steps, done
+                elif key[0] == _Order.CLIENT:
+                    self._work[key] = _Work(steps, done)
 
     def _report(self, done: "Future[Any]") -> None:
         if not done.cancelled() and isinstance(error := done.exception(), Exception):

@@ -41,25 +41,31 @@ from .start import Start
 if TYPE_CHECKING:
     from .session import Session, Viewed
 
-_MIN_TOKEN = 16
-"""Characters of a token that a user chooses."""
+_MIN_TOKEN_CHARACTERS = 16
+"""Characters of a token that a user chooses, at least; by eye."""
 _ANY_ADDRESS = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
-_TIMEOUT = 15.0
-"""Seconds for a request's head, for each further piece of a body, and for each piece of a response to be
-accepted.
+_MAX_WAIT_SECONDS = 15.0
+"""Time for a request's head, for each further piece of a body, and for each piece of a response to be
+accepted; by eye.
 """
-_MAX_HEAD = 16 << 10
-_CONNECTIONS = 64
-_PAGES = 24
-"""WebSockets at the same time."""
-_UPLOADS = 4
+_MAX_HEAD_BYTES = 16 << 10
+"""Bytes of a request's head; browsers send less than one thousand."""
+_MAX_CONNECTIONS = 64
+"""Connections at the same time; by eye."""
+_MAX_PAGES = 24
+"""WebSockets at the same time; by eye."""
+_MAX_RECEIVED_BODIES = 4
 """Bodies received at the same time: bounds the memory."""
-_MAX_BODY = 20 << 20
-_MAX_MESSAGE = 1 << 16
+_MAX_BODY_BYTES = 20 << 20
+"""Bytes of a body: those of a photograph (`uploads.MAX_BYTES`)."""
+_MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
-_MAX_FIELDS = 16
-"""Fields of an address."""
-_PIECE = 1 << 16
+_MAX_QUERY_FIELDS = 16
+"""Fields of an address; the page sends four."""
+_SENT_BYTES = 1 << 16
+"""Bytes of a piece of a response, which has to be accepted in time."""
+_LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
+"""Scripts of the served page, beside those of every page."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -124,10 +130,10 @@ def make_access(host: str, token: str | None) -> Access:
     easily guessed.
     """
     if token is not None and (
-        len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token
+        len(token) < _MIN_TOKEN_CHARACTERS or not token.isascii() or not token.isprintable() or " " in token
     ):
         raise UsageError(
-            f"--token: at least {_MIN_TOKEN} plain characters without spaces; leave it out and one is made"
+            f"--token: at least {_MIN_TOKEN_CHARACTERS} plain characters without spaces; leave it out and one is made"
         )
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(24)
@@ -149,7 +155,7 @@ class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not f
 
     def connection_made(self, transport: asyncio.Transport) -> None:
         super().connection_made(transport)
-        self.loop.call_later(_TIMEOUT, self._check_head, transport)
+        self.loop.call_later(_MAX_WAIT_SECONDS, self._check_head, transport)
 
     def _check_head(self, transport: asyncio.Transport) -> None:
         if self.cycle is None and transport.get_protocol() is self:
@@ -176,7 +182,7 @@ class Guard:
         refused = None
         if any(len(connection.headers.getlist(name)) > 1 for name in ("host", "origin")):
             refused = (400, "the header host or origin comes twice")
-        elif len(connection.query_params.multi_items()) > _MAX_FIELDS:
+        elif len(connection.query_params.multi_items()) > _MAX_QUERY_FIELDS:
             refused = (400, "the address has too many fields")
         elif (refusal := self._access.refusal(connection.headers, given)) is not None:
             refused = (403, refusal)
@@ -195,12 +201,16 @@ class Guard:
             body = message.get("body", b"")
             start = 0
             try:
-                while len(body) - start > _PIECE:
-                    piece = {"type": message["type"], "body": body[start : start + _PIECE], "more_body": True}
-                    await asyncio.wait_for(send(piece), _TIMEOUT)
-                    start += _PIECE
+                while len(body) - start > _SENT_BYTES:
+                    piece = {
+                        "type": message["type"],
+                        "body": body[start : start + _SENT_BYTES],
+                        "more_body": True,
+                    }
+                    await asyncio.wait_for(send(piece), _MAX_WAIT_SECONDS)
+                    start += _SENT_BYTES
                 await asyncio.wait_for(
-                    send({**message, "body": body[start:]} if start else message), _TIMEOUT
+                    send({**message, "body": body[start:]} if start else message), _MAX_WAIT_SECONDS
                 )
             except OSError as error:
                 raise _GoneError from error
@@ -260,7 +270,7 @@ class ViewerServer:
         self._opened = contextlib.ExitStack()
         self._clients: dict[Hashable, Client] = {}
         self._numbers = count(1)
-        self._uploads = asyncio.Semaphore(_UPLOADS)
+        self._uploads = asyncio.Semaphore(_MAX_RECEIVED_BODIES)
         self._loop: asyncio.AbstractEventLoop | None = None
         try:
             address = socket.getaddrinfo(access.host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
@@ -284,7 +294,7 @@ class ViewerServer:
             loop="asyncio",
             http=_Protocol,
             ws="websockets-sansio",
-            ws_max_size=_MAX_MESSAGE,
+            ws_max_size=_MAX_MESSAGE_BYTES,
             ws_per_message_deflate=False,
             interface="asgi3",
             lifespan="off",
@@ -293,8 +303,8 @@ class ViewerServer:
             log_level=logging.CRITICAL,
             access_log=False,
             server_header=False,
-            limit_concurrency=_CONNECTIONS,
-            h11_max_incomplete_event_size=_MAX_HEAD,
+            limit_concurrency=_MAX_CONNECTIONS,
+            h11_max_incomplete_event_size=_MAX_HEAD_BYTES,
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
@@ -308,7 +318,8 @@ class ViewerServer:
     def __exit__(self, *_: object) -> None:
         self._close_session()
         # Open WebSockets would hold an orderly end up for ever.
-        self._server.force_exit = self._server.should_exit = True
+        self._server.force_exit = True
+        self._server.should_exit = True
         self._thread.join(5)
         self._listener.close()  # uvicorn leaves it open where it ends before it has begun
 
@@ -403,9 +414,7 @@ class ViewerServer:
         page = Template(read_asset("live.html")).substitute(stage=stage)
         return [
             Route("/", _asset("text/html", lambda: page)),
-            Route(
-                "/app.js", _asset("text/javascript", lambda: script("live.js", "start.js") + "\nlive();\n")
-            ),
+            Route("/app.js", _asset("text/javascript", lambda: script(*_LIVE_SCRIPTS) + "\nlive();\n")),
             Route("/app.css", _asset("text/css", lambda: read_asset("page.css") + read_asset("live.css"))),
             WebSocketRoute("/live", self._live),
             Route("/scene", self._scene),
@@ -419,7 +428,7 @@ class ViewerServer:
         ]
 
     async def _live(self, socket: WebSocket) -> None:
-        if len(self._clients) >= _PAGES:
+        if len(self._clients) >= _MAX_PAGES:
             raise HTTPException(503, "too many pages; close one and try again")
         await socket.accept()
         self._loop = asyncio.get_running_loop()
@@ -483,7 +492,7 @@ class ViewerServer:
         return self._download(await asyncio.to_thread(self.session.gaussians), "restyled.ply")
 
     async def _film(self, request: Request) -> Response:
-        path = self.session.state.film[2]
+        path = self.session.state.film.path
         if path is None or not path.is_file():
             raise HTTPException(404, "no film yet")
         return self._download(path, f"{path.parent.name}.mp4")
@@ -522,24 +531,24 @@ class ViewerServer:
         return JSONResponse({})
 
     async def body(self, request: Request) -> bytes:
-        """A body of at most `_MAX_BODY` bytes. A longer one is refused by its header, or as soon as it is."""
+        """A body of at most `_MAX_BODY_BYTES` bytes. A longer one is refused by its header, or as soon as it is."""
         body = bytearray()
         async with self._uploads:
             try:
-                async with asyncio.timeout(_TIMEOUT) as patience:
+                async with asyncio.timeout(_MAX_WAIT_SECONDS) as patience:
                     size = int(
                         request.headers.get("content-length", "0")
                     )  # digits: the parser refuses others
                     stream = request.stream()
-                    while size <= _MAX_BODY:
+                    while size <= _MAX_BODY_BYTES:
                         if (piece := await anext(stream, None)) is None:
                             return bytes(body)
                         body += piece
                         size = max(size, len(body))
-                        patience.reschedule(asyncio.get_running_loop().time() + _TIMEOUT)
+                        patience.reschedule(asyncio.get_running_loop().time() + _MAX_WAIT_SECONDS)
             except TimeoutError:
                 raise HTTPException(408, "the request came too slowly") from None
-        raise HTTPException(413, f"more than {_MAX_BODY} bytes: make the photograph smaller")
+        raise HTTPException(413, f"more than {_MAX_BODY_BYTES} bytes: make the photograph smaller")
 
 
 def _line(error: Exception) -> str:

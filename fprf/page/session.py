@@ -40,7 +40,7 @@ from .drawing import (
 )
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
-from .state import NOW, Look, Photograph, Shown, State
+from .state import NOW, FilmProgress, Look, Photograph, SharedState, Shown
 from .uploads import Uploads, newest_step, shown_name, training_progress
 from .writer import about, packed_scene
 
@@ -49,8 +49,10 @@ if TYPE_CHECKING:
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
-_QUALITY = {False: 72, True: 90}
-"""Of JPEGs: of a preview, and of the whole picture."""
+_PREVIEW_JPEG_QUALITY = 72
+"""Quality of a preview, which is soon replaced; by eye."""
+_FINAL_JPEG_QUALITY = 90
+"""Quality of the whole picture; by eye."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,10 @@ class Session:
         self._key = secrets.token_hex(8)
         """Tells pages that a server's scene is another one, also after the server was started anew."""
         self.restyler = Restyler(viewed.scene)
-        self.state = State(look=Look(style=viewed.style), together=len(viewed.references) > 1)
+        self.state = SharedState(look=Look(style=viewed.style), together=len(viewed.references) > 1)
         self.uploads = Uploads()
         self._lock = threading.RLock()
-        self._requests: dict[Hashable, messages.View] = {}
+        self._requests: dict[Hashable, messages.ViewRequest] = {}
         self._photographs: frozenset[Photograph] = frozenset()
         self._painter: ScenePainter | None = None
         self._worker = RenderWorker(self._on_error)
@@ -151,7 +153,7 @@ class Session:
     def handle(self, client: Hashable, message: messages.AnyMessage) -> None:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
         match message:
-            case messages.View():
+            case messages.ViewRequest():
                 # Browsers draw Gaussians themselves; all else is drawn here.
                 if self._painter is not None:
                     cameras_of([message.camera])  # refused where it is none
@@ -188,7 +190,7 @@ class Session:
         """Show a line of text to all clients."""
         self._post(None, f"said {next(self._version)}", {"type": "said", "text": text[:400], "bad": bad})
 
-    def apply(self, change: Callable[[State], State]) -> None:
+    def apply(self, change: Callable[[SharedState], SharedState]) -> None:
         """Replace the state for all clients. Raises what `change` raises."""
         # Clients change the state one after the other, each what the one before it left.
         with self._lock:
@@ -329,7 +331,8 @@ class Session:
         """A picture as one byte for its kind, and a JPEG."""
         import cv2
 
-        done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY[final]])
+        quality = _FINAL_JPEG_QUALITY if final else _PREVIEW_JPEG_QUALITY
+        done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
         assert done
         self._post(client, kind, (b"\1" if kind == "captured" else b"\0") + data.tobytes())
 
@@ -354,7 +357,7 @@ class Session:
     def _record(self, seconds: float) -> None:
         """Make a film in the scene's folder while no client waits for a picture, one at a time."""
         with self._lock:
-            if self.state.film[1] and self.state.film[2] is None:
+            if self.state.film.total and self.state.film.path is None:
                 raise UsageError("film: one is being made; wait for it")
             if self.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
@@ -362,24 +365,28 @@ class Session:
             scene = self.viewed.scene
             folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
             write_film_files(folder, self.state.keys, seconds, scene)
-            self.apply(lambda state: replace(state, film=(0, 1, None)))
+            self.apply(lambda state: replace(state, film=FilmProgress(total=1)))
+        path = folder / "film.mp4"
+
+        def progress(film: FilmProgress) -> None:
+            self.apply(lambda state: replace(state, film=film))
 
         def rendered(frames: list[Steps[Picture]]) -> Iterator[Picture]:
             for done, frame in enumerate(frames, 1):
                 yield self._worker.result_when_idle(frame)
-                self.apply(lambda state, done=done: replace(state, film=(done, len(frames), None)))  # type: ignore[misc]
+                progress(FilmProgress(done=done, total=len(frames)))
 
         def work() -> None:
             try:
                 # Frames are rendered one at a time, as the encoder asks for them.
                 frames = self._worker.result(lambda: film_frames(folder, scene))
-                write_video(folder / "film.mp4", rendered(frames), FPS)
+                write_video(path, rendered(frames), FPS)
             except Exception as error:  # whatever it is, the next film can be made
-                self.apply(lambda state: replace(state, film=(0, 0, None)))
+                progress(FilmProgress())
                 self.notify(f"film: {error}", bad=True)
                 return
-            self.apply(lambda state: replace(state, film=(*state.film[:2], folder / "film.mp4")))
-            self.notify(f"film: {folder / 'film.mp4'}")
+            progress(replace(self.state.film, path=path))
+            self.notify(f"film: {path}")
 
         threading.Thread(target=work, name="fprf-film", daemon=True).start()
 
@@ -396,7 +403,7 @@ def _colours_message(name: str, version: int) -> dict[str, Any]:
     return {"type": "colours", "name": name, "version": version}
 
 
-_POLL = 0.5
+_POLL_SECONDS = 0.5
 """Seconds between looks at a run folder."""
 
 
@@ -418,7 +425,7 @@ class TrainingFollower:
 
     def run(self, ended: threading.Event) -> None:
         """Follow until the event is set."""
-        while not ended.wait(_POLL):
+        while not ended.wait(_POLL_SECONDS):
             try:
                 self.tick()
             except (FprfError, OSError) as error:  # the page says so; the next checkpoint may be better

@@ -30,24 +30,25 @@ if TYPE_CHECKING:
     from .session import Viewed
 
 METHOD = "fprf-splats"
-_FILES = "files"
-_SCENE = "scene"
-_RUN = "run"
-_LINES = 40
-"""Lines of a process that are kept."""
-_RECENT = 12
-_EXIT_TIMEOUT = 10.0
-"""Seconds that a process has to save and end."""
+_FILES_FOLDER = "files"
+_SCENE_FOLDER = "scene"
+_RUN_FOLDER = "run"
+_MAX_KEPT_LINES = 40
+"""Lines of a process that are kept; by eye."""
+_MAX_RECENT_SCENES = 12
+"""Scenes that the page offers to open; by eye."""
+_MAX_EXIT_SECONDS = 10.0
+"""Seconds that a process has to save and end; by eye."""
 
-Stage: TypeAlias = Literal["idle", "poses", "training", "opening", "open"]
+StartStage: TypeAlias = Literal["idle", "poses", "training", "opening", "open"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class StartProgress:
     """Progress of a scene that is being made."""
 
     name: str = ""
-    stage: Stage = "idle"
+    stage: StartStage = "idle"
     what: str = ""
     """Present stage, in words."""
     share: float | None = None
@@ -74,7 +75,7 @@ class Start:
         self._server = server
         self._load = load
         self._uploads: dict[str, SceneFiles] = {}
-        self._progress = Progress()
+        self._progress = StartProgress()
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._stopped = ""
@@ -85,7 +86,7 @@ class Start:
         """End what is being made, as an interrupt at the terminal would."""
         self._interrupt("leave")
         if self._thread is not None:
-            self._thread.join(_EXIT_TIMEOUT)
+            self._thread.join(_MAX_EXIT_SECONDS)
 
     def state(self) -> dict[str, Any]:
         """How far it is, as the page reads it; idle, what can be opened."""
@@ -100,7 +101,7 @@ class Start:
         match asked:
             case New():
                 name = self._unused(asked.name)
-                self._uploads[name] = SceneFiles(self._output / name / _FILES)
+                self._uploads[name] = SceneFiles(self._output / name / _FILES_FOLDER)
                 return {"scene": name}
             case Make():
                 # The folder came with the first file that was taken: none of those that were sent may have
@@ -119,12 +120,14 @@ class Start:
                 source = find_source(path)
                 whole = path.resolve()
                 if source.kind == "run":
-                    if whole.name == _RUN:
+                    if whole.name == _RUN_FOLDER:
                         name = whole.parent.name
                     else:
                         name = whole.name
                 else:
-                    ours = whole.name in (_FILES, _SCENE) and whole.parent.parent == self._output
+                    ours = (
+                        whole.name in (_FILES_FOLDER, _SCENE_FOLDER) and whole.parent.parent == self._output
+                    )
                     if ours:
                         name = whole.parent.name
                     else:
@@ -135,7 +138,7 @@ class Start:
             case Stop() | Leave():  # a failure is put away, with what is shown of it
                 if self._busy:
                     self._interrupt("leave")
-                self._progress = Progress()
+                self._progress = StartProgress()
                 self._server.show_start(self)
         return {}
 
@@ -160,7 +163,7 @@ class Start:
                 folder = self._output / name
             else:
                 folder = source.path
-            self._progress = Progress(name=name, stage="opening", folder=str(folder))
+            self._progress = StartProgress(name=name, stage="opening", folder=str(folder))
             self._thread = threading.Thread(
                 target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True
             )
@@ -176,11 +179,11 @@ class Start:
         try:
             if source.kind in ("photographs", "video"):
                 self._set(stage="poses", what="looking at the photographs")
-                self._call(["process", str(path), "--output", str(root / _SCENE)])
-                path = root / _SCENE
+                self._call(["process", str(path), "--output", str(root / _SCENE_FOLDER)])
+                path = root / _SCENE_FOLDER
             if source.kind in ("photographs", "video", "scene"):
                 self._set(stage="training", what="reading photographs", share=None, detail="")
-                self._train(path, root / _RUN, name, minutes)
+                self._train(path, root / _RUN_FOLDER, name, minutes)
             else:
                 self._set(stage="opening", what="opening the scene", share=None, detail="")
                 self._server.open(partial(self._load, path, name))
@@ -188,7 +191,7 @@ class Start:
                 raise _Left
             self._set(stage="open")
         except _Left:
-            self._progress = Progress()
+            self._progress = StartProgress()
             self._server.show_start(self)
         except FprfError as error:
             self._set(error=str(error))
@@ -259,7 +262,7 @@ class Start:
         except ValueError:
             event = None
         if not isinstance(event, dict) or "event" not in event:
-            self._set(lines=(*self._progress.lines, line)[-_LINES:])
+            self._set(lines=(*self._progress.lines, line)[-_MAX_KEPT_LINES:])
             return
         what = str(event["event"])
         # Training tells its step and clock, other verbs how much of something is done; anything else is a
@@ -275,7 +278,7 @@ class Start:
             share = event["done"] / max(1, event["total"])
             self._set(what=what, share=share, detail=f"{event['done']} of {event['total']}")
         else:
-            self._set(lines=(*self._progress.lines, what)[-_LINES:])
+            self._set(lines=(*self._progress.lines, what)[-_MAX_KEPT_LINES:])
 
     def _interrupt(self, then: str) -> None:
         """Let the process that runs save and end; one that does not is killed."""
@@ -284,14 +287,14 @@ class Start:
         if process is not None:
             with contextlib.suppress(OSError):
                 process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
-            last = threading.Timer(_EXIT_TIMEOUT, process.kill)
+            last = threading.Timer(_MAX_EXIT_SECONDS, process.kill)
             last.daemon = True
             last.start()
 
     def _set(self, **changes: Any) -> None:
         self._tell(replace(self._progress, **changes))
 
-    def _tell(self, progress: Progress) -> None:
+    def _tell(self, progress: StartProgress) -> None:
         self._progress = progress
         self._server.post(None, "start", self.state())
 
@@ -305,41 +308,38 @@ class Start:
         last = asked.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
         plain = "".join(c if c.isalnum() or c in "-_" else "-" for c in last)[:40].strip("-") or "scene"
         # A number is added until no folder and no upload has the name.
-        names = (plain if k == 1 else f"{plain}-{k}" for k in count(1))
-        return next(
-            name for name in names if name not in self._uploads and not (self._output / name).exists()
-        )
+        name = plain
+        for number in count(2):
+            if name not in self._uploads and not (self._output / name).exists():
+                break
+            name = f"{plain}-{number}"
+        return name
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
         # Runs of the terminal lie in `runs`, that of the demo in its folder.
-        runs = [
-            (path.parent, path.parent.name)
-            for path in Path("runs").glob("*/config.json")
-            if newest_step(path.parent) >= 0
-        ]
-        found = [*runs, (Path("demo/run"), "demo")]
-        for folder in self._output.glob(
-            "*/"
-        ):  # a scene's run, and its files where training has not come to its end
-            run = folder / _RUN
-            files = folder / _FILES
-            scene = folder / _SCENE
+        found = [(Path("demo/run"), "demo")]
+        for path in Path("runs").glob("*/config.json"):
+            if newest_step(path.parent) >= 0:
+                found.append((path.parent, path.parent.name))
+        # A scene's run, and its files where training has not come to its end.
+        for folder in self._output.glob("*/"):
+            run = folder / _RUN_FOLDER
+            files = folder / _FILES_FOLDER
+            scene = folder / _SCENE_FOLDER
             trained = newest_step(run) >= 0
+            progress: dict[str, Any] | None = {"share": 0}
             if trained:
                 progress = training_progress(run)
-            else:
-                progress = {"share": 0}
-            if trained:
                 found.append((run, folder.name))
             if progress is not None and progress["share"] < 1:
                 found.append((scene if trained and not files.is_dir() else files, folder.name))
         dated = [(path.stat().st_mtime, path, name) for path, name in found if path.is_dir()]
         rows = []
-        for date, path, name in sorted(dated, reverse=True)[:_RECENT]:
+        for date, path, name in sorted(dated, reverse=True)[:_MAX_RECENT_SCENES]:
             kind = "trained"
-            if path.name in (_FILES, _SCENE):
-                some = newest_step(path.with_name(_RUN)) >= 0
+            if path.name in (_FILES_FOLDER, _SCENE_FOLDER):
+                some = newest_step(path.with_name(_RUN_FOLDER)) >= 0
                 capture = any(is_capture(each) for each in (path, *path.iterdir()))
                 if some:
                     kind = "train on"

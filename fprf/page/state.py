@@ -23,11 +23,14 @@ from ..style.dictionary import Reference
 from . import messages
 from .messages import SHELF, Camera
 
-Map: TypeAlias = Literal["none", "matches", "regions"]
+MapKind: TypeAlias = Literal["none", "matches", "regions"]
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
 NOW = "Now"
 """Name of the colours of the present look, beside those of looks that are kept."""
-_MAX_KEYS = 64
+_MAX_KEPT_LOOKS = 64
+"""Looks that are kept by name; by eye."""
+_MAX_KEYFRAMES = 64
+"""Keyframes of a film; by eye."""
 
 
 def _sliders(style: StyleConfig) -> dict[str, float]:
@@ -80,9 +83,8 @@ class Look:
     def mixed(self, mix: Iterable[tuple[Photograph, float]]) -> "Look":
         """The look with other photographs; rules that name a photograph that is not among them go."""
         mix = tuple(mix)
-        rules = frozenset(
-            rule for rule in self.rules if rule.photograph is None or rule.photograph in dict(mix)
-        )
+        kept = {None, *dict(mix)}
+        rules = frozenset(rule for rule in self.rules if rule.photograph in kept)
         return replace(self, mix=mix, rules=rules)
 
     def weighted(self, photograph: Photograph, weight: float, shelf: Iterable[Photograph]) -> "Look":
@@ -146,7 +148,7 @@ class RegionInfo(NamedTuple):
     """Share that it takes from each photograph, the largest first; empty without a style."""
 
 
-class Key(NamedTuple):
+class PageKeyframe(NamedTuple):
     """A keyframe of a film."""
 
     camera: Camera
@@ -157,26 +159,37 @@ class Shown(NamedTuple):
     """A look, a map and a region to draw."""
 
     look: Look
-    map: Map = "none"
+    map: MapKind = "none"
     region: int | None = None
     """A region to be highlighted; the others are dimmed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
+class FilmProgress:
+    """A film that is being made, or was made last."""
+
+    done: int = 0
+    """Frames that are rendered."""
+    total: int = 0
+    """Frames of all; 0 = no film was asked for."""
+    path: Path | None = None
+    """Its file, once it is finished."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedState:
     """State that all clients share; each has a camera of its own."""
 
     shelf: tuple[Photograph, ...] = ()
     look: Look = field(default_factory=Look)
     together: bool = False
     """A photograph that is dropped joins the others; else it becomes the style alone."""
-    map: Map = "none"
+    map: MapKind = "none"
     picked: RegionInfo | None = None
     kept: tuple[tuple[str, Look], ...] = ()
     """Looks that were kept, by name."""
-    keys: tuple[Key, ...] = ()
-    film: tuple[int, int, Path | None] = (0, 0, None)
-    """Frames done, of how many, and the film that is finished."""
+    keys: tuple[PageKeyframe, ...] = ()
+    film: FilmProgress = FilmProgress()
 
     @property
     def shown(self) -> Shown:
@@ -191,9 +204,12 @@ class State:
     @property
     def in_use(self) -> frozenset[Photograph]:
         """Photographs that some look needs."""
-        return frozenset(photograph for look in self.looks for photograph, _ in look.mix)
+        used: set[Photograph] = set()
+        for look in self.looks:
+            used.update(dict(look.mix))
+        return frozenset(used)
 
-    def renumbered(self, regions: Sequence[int]) -> "State":
+    def renumbered(self, regions: Sequence[int]) -> "SharedState":
         """With region r as regions[r] in the rules of all looks; none is picked: regions were measured
         again.
         """
@@ -217,7 +233,7 @@ class State:
             else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)
         )
 
-    def added(self, photograph: Photograph) -> "State":
+    def added(self, photograph: Photograph) -> "SharedState":
         """With a new photograph on the shelf and in the look; the oldest one that no look needs makes
         room.
         """
@@ -236,14 +252,14 @@ class State:
             state = state.removed(spare[0])
         return state
 
-    def removed(self, photograph: Photograph) -> "State":
+    def removed(self, photograph: Photograph) -> "SharedState":
         """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep
         it.
         """
         shelf = tuple(each for each in self.shelf if each is not photograph)
         return replace(self, shelf=shelf, look=self.look.weighted(photograph, 0.0, shelf))
 
-    def changed(self, message: messages.Change) -> "State":
+    def changed(self, message: messages.Change) -> "SharedState":
         """What a control of the page makes of the state. Raises UsageError or ConfigError for what is not
         possible.
         """
@@ -290,16 +306,16 @@ class State:
                     return replace(self, look=kept[name])
                 if not name or name in (NOW, "Captured") or message.action == "restore":
                     raise UsageError("keep look: give it a name of its own")
-                if len(kept.keys() - {name}) >= _MAX_KEYS:
-                    raise UsageError(f"keep look: at most {_MAX_KEYS} are kept")
+                if len(kept.keys() - {name}) >= _MAX_KEPT_LOOKS:
+                    raise UsageError(f"keep look: at most {_MAX_KEPT_LOOKS} are kept")
                 kept.pop(name, None)  # a look that takes the place of another comes last
                 return replace(self, kept=(*kept.items(), (name, look)))
             case messages.Key(action="add"):
                 if message.camera is None:
                     raise UsageError("key: a camera is needed")
-                if len(self.keys) >= _MAX_KEYS:
-                    raise UsageError(f"film: at most {_MAX_KEYS} keys; remove one first")
-                return replace(self, keys=(*self.keys, Key(message.camera, look)))
+                if len(self.keys) >= _MAX_KEYFRAMES:
+                    raise UsageError(f"film: at most {_MAX_KEYFRAMES} keys; remove one first")
+                return replace(self, keys=(*self.keys, PageKeyframe(message.camera, look)))
             case messages.Key():
                 keys = list(self.keys)
                 at = message.at
@@ -336,21 +352,19 @@ class State:
             for name, share in picked.taken:
                 taken.append({"name": name, "share": share})
             region = {"region": picked.region, "share": picked.share, "taken": taken, "rules": rules}
+        shelf = []
+        for each in self.shelf:
+            weight = weights.get(each, 0.0)
+            card = {"card": each.number, "name": each.name, "weight": weight, "colour": colours.get(each)}
+            shelf.append(card)
+        film = self.film
         return {
             "type": "state",
-            "shelf": [
-                {
-                    "card": each.number,
-                    "name": each.name,
-                    "weight": weights.get(each, 0.0),
-                    "colour": colours.get(each),
-                }
-                for each in self.shelf
-            ],
+            "shelf": shelf,
             "look": _sliders(self.look.style),
             "map": self.map,
             "picked": region,
             "kept": [name for name, _ in self.kept],
             "keys": [msgspec.to_builtins(key.camera) for key in self.keys],
-            "film": {"done": self.film[0], "total": self.film[1], "ready": self.film[2] is not None},
+            "film": {"done": film.done, "total": film.total, "ready": film.path is not None},
         }

@@ -33,13 +33,13 @@ MAX_BYTES = 20 << 20
 """Bytes of a photograph."""
 MAX_SIDE = 1024
 """Longest side of what is kept of one: scenes' views are hardly larger."""
-_TIMEOUT = 30.0
-"""Seconds for one photograph, the start of the decoder included."""
-_MEMORY = 2 << 30
+_MAX_DECODING_SECONDS = 30.0
+"""Seconds for one photograph, the start of the decoder included; by eye."""
+_MAX_DECODER_BYTES = 2 << 30
 """Bytes beyond what the decoder has at its start: 1e8 pixels take 0.3 GB, and some copies."""
-_MAX_ANSWER = 4096
-"""Bytes."""
-_NAME = 48
+_MAX_ANSWER_BYTES = 4096
+"""Bytes of what the decoder says; it is one sentence."""
+_MAX_NAME_CHARACTERS = 48
 """Characters of a name that is shown."""
 
 
@@ -57,15 +57,15 @@ def shown_name(text: str) -> str:
     """The last part of the file name that a browser gave, with plain characters alone, at most 48 of them."""
     last = text.replace("\\", "/").rsplit("/", 1)[-1]
     plain = "".join(c if c.isalnum() or c in " ._-()+" else "_" for c in last if c.isprintable()).strip(" .")
-    if len(plain) > _NAME:
-        plain = f"{plain[: _NAME - 12]}…{plain[-11:]}"
+    if len(plain) > _MAX_NAME_CHARACTERS:
+        plain = f"{plain[: _MAX_NAME_CHARACTERS - 12]}…{plain[-11:]}"
     return plain or "photograph"
 
 
 class Uploads:
     """The folder of uploaded photographs and the decoder; both go with `close`."""
 
-    def __init__(self, timeout: float = _TIMEOUT) -> None:
+    def __init__(self, timeout: float = _MAX_DECODING_SECONDS) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="fprf-view-")
         self.folder = Path(self._folder.name)
         self._timeout = timeout
@@ -92,7 +92,7 @@ class Uploads:
                 # Bytes and no pickles: whatever a photograph made of the decoder, its answer is text here.
                 pipe.send_bytes(json.dumps([str(source), str(target)]).encode())
                 if pipe.poll(self._timeout):
-                    answer = pipe.recv_bytes(_MAX_ANSWER).decode(errors="replace")
+                    answer = pipe.recv_bytes(_MAX_ANSWER_BYTES).decode(errors="replace")
                 else:
                     answer = f"not decoded within {self._timeout:g} s; export it again"
                     self._end()
@@ -130,7 +130,8 @@ class Uploads:
             self._process.join()
             self._process.close()
             self._pipe.close()
-        self._process = self._pipe = None
+        self._process = None
+        self._pipe = None
 
 
 def limit_memory(room: int) -> None:
@@ -154,7 +155,7 @@ def decode_photographs(pipe: Connection) -> None:
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # an interrupt at the terminal is the viewer's, which ends this one
-    limit_memory(_MEMORY)  # what is imported does not count
+    limit_memory(_MAX_DECODER_BYTES)  # what is imported does not count
     while True:
         try:
             source, target = json.loads(pipe.recv_bytes())
@@ -167,24 +168,27 @@ def decode_photographs(pipe: Connection) -> None:
             said = str(fault).removeprefix(f"{source}: ")  # the file's own name means nothing to the client
         except Exception as fault:  # whatever a decoder raises over a stranger's bytes
             said = f"cannot be decoded ({type(fault).__name__}); export it again, or make it smaller"
-        pipe.send_bytes(said.encode(errors="replace")[:_MAX_ANSWER])
+        pipe.send_bytes(said.encode(errors="replace")[:_MAX_ANSWER_BYTES])
 
 
 SourceKind: TypeAlias = Literal["run", "capture", "scene", "photographs", "video"]
-_FEWEST = 3
+_MIN_POSED_PHOTOGRAPHS = 3
 """Photographs that poses can be found for."""
-_MODEL = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
+_COLMAP_FILES = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
 """Files of a COLMAP model, without their endings .bin and .txt."""
-_ATOMS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+_VIDEO_PARTS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 """Kinds of the first part of an MP4 or QuickTime file."""
-_MAX_FILES = 4000
+_MAX_SCENE_FILES = 4000
+"""Files of a scene; by eye: more than are trained in a sitting."""
 _MAX_SCENE_BYTES = 16 << 30
-"""Of all files of a scene."""
-_ROOM = 1 << 30
+"""Bytes of all files of a scene; by eye."""
+_MIN_FREE_BYTES = 1 << 30
 """Bytes of the disk that are left free."""
-_MAX_DEPTH = 6
-_MAX_PART = 120
-_TAIL = 4096
+_MAX_FOLDER_DEPTH = 6
+"""Folders within each other; by eye."""
+_MAX_PART_CHARACTERS = 120
+"""Characters of a part of a path: file systems take 255 bytes."""
+_LAST_LINE_BYTES = 4096
 """Bytes of the end of events.jsonl that hold its last line."""
 
 
@@ -205,9 +209,9 @@ def _kinds() -> str:
 
 def is_capture(path: Path) -> bool:
     """True for a path that is named like a capture of 3D Gaussians."""
-    return format_name(path) is not None or any(
-        (path / name).is_file() for name in ("meta.json", "lod-meta.json")
-    )
+    if format_name(path) is not None:
+        return True
+    return (path / "meta.json").is_file() or (path / "lod-meta.json").is_file()
 
 
 def newest_step(run: Path) -> int:
@@ -222,7 +226,7 @@ def training_progress(root: Path) -> dict[str, Any] | None:
     """
     try:
         with (root / "events.jsonl").open("rb") as file:
-            file.seek(max(0, file.seek(0, 2) - _TAIL))
+            file.seek(max(0, file.seek(0, 2) - _LAST_LINE_BYTES))
             # The first line of the tail may be cut off; events without a share tell nothing of progress.
             lines = []
             for line in file.read().decode(errors="replace").splitlines()[1:]:
@@ -269,7 +273,7 @@ def find_source(path: Path) -> Source:
     for each in files:
         if each.suffix.lower() in IMAGE_SUFFIXES:
             photographs.append(each)
-    if len(photographs) >= _FEWEST:
+    if len(photographs) >= _MIN_POSED_PHOTOGRAPHS:
         return Source("photographs", path)
     kinds: tuple[tuple[SourceKind, list[Path]], ...] = (
         ("capture", [each for each in files if format_name(each) is not None]),
@@ -286,7 +290,9 @@ def find_source(path: Path) -> Source:
             few = "1 photograph is"
         else:
             few = f"{len(photographs)} photographs are"
-        raise DataError(f"{few} no scene: take at least {_FEWEST}, better 20 to 60, from places around it")
+        raise DataError(
+            f"{few} no scene: take at least {_MIN_POSED_PHOTOGRAPHS}, better 20 to 60, from places around it"
+        )
     raise DataError(f"{path.name}: nothing that a scene can be made of; give {_kinds()}")
 
 
@@ -308,7 +314,7 @@ def check_file(name: str, head: bytes, size: int) -> None:
         ".npy": head.startswith(b"\x93NUMPY"),
         ".json": head.lstrip()[:1] in (b"{", b"["),
         **dict.fromkeys(VIDEO_SUFFIXES, _begins_video(head)),
-        **dict.fromkeys((".bin", ".txt") if stem in _MODEL else (), True),
+        **dict.fromkeys((".bin", ".txt") if stem in _COLMAP_FILES else (), True),
     }
     if suffix not in whole:
         raise DataError(f"{name}: cannot become a scene; give {_kinds()}")
@@ -316,9 +322,20 @@ def check_file(name: str, head: bytes, size: int) -> None:
         raise DataError(f"{name}: damaged, or no {suffix} file; export it again")
 
 
+def _is_plain(part: str) -> bool:
+    """True for a part of a path that is a plain name on every system."""
+    if not part.isprintable() or part.startswith("."):
+        return False
+    return not {*part} & {*'\\:*?"<>|'} and len(part) <= _MAX_PART_CHARACTERS
+
+
 def _begins_video(head: bytes) -> bool:
     """True for the first bytes of MP4, QuickTime, AVI, Matroska, an MPEG program or transport stream."""
-    if head[4:8] in _ATOMS or head[8:11] == b"AVI" or head.startswith((b"\x1aE\xdf\xa3", b"\0\0\1\xba")):
+    if (
+        head[4:8] in _VIDEO_PARTS
+        or head[8:11] == b"AVI"
+        or head.startswith((b"\x1aE\xdf\xa3", b"\0\0\1\xba"))
+    ):
         return True
     # Packets of a transport stream begin with G, those of cameras after a time of four bytes.
     return b"G" in (head[:1], head[4:5])
@@ -329,7 +346,8 @@ class SceneFiles:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._files = self._bytes = 0
+        self._files = 0
+        self._bytes = 0
         self._lock = threading.Lock()
 
     def add(self, name: str, at: int, size: int, data: bytes) -> None:
@@ -340,25 +358,19 @@ class SceneFiles:
         """
         # The name leads to a place below the folder, by parts that are plain names on every system.
         parts = PurePosixPath(name).parts
-        plain = all(
-            part.isprintable()
-            and not part.startswith(".")
-            and not {*part} & {*'\\:*?"<>|'}
-            and len(part) <= _MAX_PART
-            for part in parts
-        )
-        if not parts or not plain or name.startswith("/") or len(parts) > _MAX_DEPTH:
+        plain = all(_is_plain(part) for part in parts)
+        if not parts or not plain or name.startswith("/") or len(parts) > _MAX_FOLDER_DEPTH:
             raise UsageError(f"{name[:80]!r}: no name of a file in a folder; rename it")
         path = self.folder.joinpath(*parts)
         part = path.with_name(f"{path.name}.part")
         with self._lock:
             if at == 0:
                 check_file(path.name, data, size)
-                if self._files >= _MAX_FILES or self._bytes + size > _MAX_SCENE_BYTES:
-                    limits = f"at most {_MAX_FILES} files of {_MAX_SCENE_BYTES >> 30} GiB in all"
+                if self._files >= _MAX_SCENE_FILES or self._bytes + size > _MAX_SCENE_BYTES:
+                    limits = f"at most {_MAX_SCENE_FILES} files of {_MAX_SCENE_BYTES >> 30} GiB in all"
                     raise DataError(f"{path.name}: a scene takes {limits}")
                 path.parent.mkdir(parents=True, exist_ok=True)
-                if shutil.disk_usage(path.parent).free < size + _ROOM:
+                if shutil.disk_usage(path.parent).free < size + _MIN_FREE_BYTES:
                     raise DataError(f"{path.name}: the disk of {self.folder} is full; make room there")
                 self._files = self._files + 1
                 self._bytes = self._bytes + size

@@ -23,23 +23,33 @@ from ..io.maps import palette
 from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
 from ..scenes import Scene
-from ..splats.photographs import camera_of
+from ..splats.pinholes import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
 from . import read_asset, script
 from .pack import Packed, colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
-_STILL = 800
-_VIEW = 512
-_MAP = 320
-"""Longest sides in pixels: of pictures on the stage and below it, of match maps."""
+_STAGE_PIXELS = 800
+"""Longest side of a picture on the stage; by eye."""
+_VIEW_PIXELS = 512
+"""Longest side of a view below it; by eye."""
+_MATCH_MAP_PIXELS = 320
+"""Longest side of a match map; by eye."""
 REFERENCE_PIXELS = 320
 """Longest side of references: as match maps, which lie beside them."""
-_CAMERAS = 48
-"""Captured cameras that one can go to, at most."""
-_ROOM = 1.6
-"""How far one may go from the middle of the cameras, relative to the farthest of them."""
+_MAX_PAGE_CAMERAS = 48
+"""Captured cameras that one can go to, at most; by eye."""
+_REACH_RATIO = 1.6
+"""How far one may go from the middle of the cameras, relative to the farthest of them; by eye."""
+_REACH_DEPTHS = 0.5
+"""How much farther, in the median distance of what is looked at; by eye."""
+_FITTED_SHARE = 0.98
+"""Share kept of the Gaussians that would fit by the mean: what shows most compresses least."""
+_MAX_FITTING_ROUNDS = 16
+"""Times that a page is packed until it is small enough; each comes nearer."""
+_MAX_MEDIAN_GAUSSIANS = 100_000
+"""Gaussians that a median distance is taken of: enough for a median."""
 
 
 class Reference(NamedTuple):
@@ -124,7 +134,7 @@ def page_html(
     # the views.
     empty = len(fixed.encode())
     kept = None
-    for _ in range(16):
+    for _ in range(_MAX_FITTING_ROUNDS):
         _, head, parts = packed_scene(scene, harmonics, page.start, kept)
         text = _text(page, head, parts)
         size = len(text.encode())
@@ -135,7 +145,7 @@ def page_html(
             break
         share = (room - empty) / max(1, size - empty)
         # A little less than would fit by the mean: what shows most compresses least.
-        kept = scene.seen.weights.topk(max(1, int(0.98 * share * count))).indices.sort().values
+        kept = scene.seen.weights.topk(max(1, int(_FITTED_SHARE * share * count))).indices.sort().values
     sizes = f"{empty / 2**20:.1f} MiB without any Gaussian, {size / 2**20:.1f} MiB with {count}"
     raise DataError(f"{path}: {sizes}; allow more than {megabytes:g} MiB")
 
@@ -190,7 +200,7 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
     """
     # Evenly chosen cameras in their order, rotated so that the one to start from comes first.
     others = sorted(
-        {*torch.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().long().tolist()}
+        {*torch.linspace(0, len(cameras) - 1, min(_MAX_PAGE_CAMERAS, len(cameras))).round().long().tolist()}
     )
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
     depths = [depth(view) for view in chosen]
@@ -199,7 +209,10 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
     # to see.
     place = cameras.pose[:, :, 3].double()
     centre = place.mean(0)
-    radius = _ROOM * float((place - centre).norm(dim=1).max()) + 0.5 * sorted(depths)[len(depths) // 2]
+    radius = (
+        _REACH_RATIO * float((place - centre).norm(dim=1).max())
+        + _REACH_DEPTHS * sorted(depths)[len(depths) // 2]
+    )
     return {
         "up": up.tolist(),
         "reach": {"centre": centre.tolist(), "radius": radius},
@@ -230,7 +243,7 @@ def _depth(scene: SplatScene, view: int) -> float:
     # thirds of the picture.
     means = scene.gaussians.means
     at = (
-        means[:: max(1, len(means) // 100_000)].double() @ camera.world_to_camera[:3, :3].T
+        means[:: max(1, len(means) // _MAX_MEDIAN_GAUSSIANS)].double() @ camera.world_to_camera[:3, :3].T
         + camera.world_to_camera[:3, 3]
     )
     depth = at[:, 2].clamp_min(1e-9)
@@ -251,7 +264,7 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     pictures = [[view.original for view in page.views], *(style.stills for style in page.styles)]
     stills = []
     for row in pictures:
-        stills.append([data_uri(shrink(each, _STILL)) for each in row[:most]])
+        stills.append([data_uri(shrink(each, _STAGE_PIXELS)) for each in row[:most]])
     heads = [{}] * len(names) if head is None else head["styles"]
     data = {
         "scene": None if head is None else {key: value for key, value in head.items() if key != "styles"},
@@ -269,6 +282,13 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     facts = ((name, fact if isinstance(fact, str) else f"{fact:,}") for name, fact in page.facts.items())
     rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts)
     present = [(name, part) for name, part in below if part]
+    body = []
+    for name, part in present:
+        body.append(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>')
+    scripts = []
+    for name, packed in parts.items():
+        text = base64.b64encode(packed).decode()
+        scripts.append(f'<script type="text/plain" id="data-{name}">{text}</script>')
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
     return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
@@ -281,16 +301,11 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
             ratio=f'style="--ratio:{width / height:.4f}"',
             facts=f'<dl class="facts">{rows}</dl>' if rows else "",
         ),
-        body="\n".join(
-            f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>' for name, part in present
-        ),
+        body="\n".join(body),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),
         # "<" cannot end the script then, whatever a name holds.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
-        sections="\n".join(
-            f'<script type="text/plain" id="data-{name}">{base64.b64encode(part).decode()}</script>'
-            for name, part in parts.items()
-        ),
+        sections="\n".join(scripts),
         script=code,
     )
 
@@ -304,12 +319,13 @@ def _img(picture: Picture, side: int, alt: str) -> str:
 
 def _views(views: Sequence[PageView]) -> str:
     """Photographs beside what the scene shows from their places."""
-    rows = "".join(
-        f'<figure><div class="pair">{_img(view.photograph, _VIEW, f"Photograph {view.name}")}'
-        f"{_img(view.original, _VIEW, f'View {view.name}')}</div><figcaption>{escape(view.name)}</figcaption></figure>"
-        for view in views
-        if view.photograph is not None
-    )
+    rows = ""
+    for view in views:
+        if view.photograph is not None:
+            photograph = _img(view.photograph, _VIEW_PIXELS, f"Photograph {view.name}")
+            shown = _img(view.original, _VIEW_PIXELS, f"View {view.name}")
+            caption = f"<figcaption>{escape(view.name)}</figcaption>"
+            rows += f'<figure><div class="pair">{photograph}{shown}</div>{caption}</figure>'
     lead = "Photographs that training did not see, and beside them the scene."
     return f'<p class="lead">{lead}</p><div class="grid">{rows}</div>'
 
@@ -336,10 +352,10 @@ def _style(style: Style, views: Sequence[PageView], known: Mapping[str, Referenc
         rows.append(
             f"<figure>{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>"
         )
-    maps = "".join(
-        f"<figure>{_img(each, _MAP, view.name)}<figcaption>{escape(view.name)}</figcaption></figure>"
-        for view, each in zip(views, style.matches, strict=False)
-    )
+    maps = ""
+    for view, each in zip(views, style.matches, strict=False):
+        image = _img(each, _MATCH_MAP_PIXELS, view.name)
+        maps += f"<figure>{image}<figcaption>{escape(view.name)}</figcaption></figure>"
     return f"""<article class="style"><h3>{escape(style.name)}</h3>
 <div class="sources">{"".join(rows)}</div>
 {f'<p class="lead">Which reference each place took its style from</p><div class="grid small">{maps}</div>' if maps else ""}

@@ -44,9 +44,10 @@ from ..types import Cell
 from .config import UNTRAINED, GaussiansConfig
 from .gaussians import Gaussians, from_tensors, joined, tensors_of
 from .initial import curve_order
-from .learner import CPU, Bounds, GaussianLearner, Source, Stage, left_out, refined
+from .learner import CPU, Bounds, GaussianLearner, RunSource, Stage, left_out, refined
 from .levels import in_view
-from .photographs import covering, load_photographs, make_levels
+from .photographs import load_photographs, make_levels
+from .pinholes import covering
 from .setup import build, light_and_poses, limit_widths, scene_scale
 from .view_corrections import MOVES, ViewCorrections
 
@@ -249,7 +250,7 @@ class CellPart(Part):
             ),
             corrections=ViewCorrections(tones),
             stage=Stage(before=start.step, first=config.overview),
-            source=Source(known=known_of(own, config.data, self.facts), points="the whole scene"),
+            source=RunSource(known=known_of(own, config.data, self.facts), points="the whole scene"),
             device=device,
         )
         # Their moments go on, and their number grows as if it had from the beginning of the schedule.

@@ -12,7 +12,7 @@ from ..ops.rasterise.rendering import Pinhole, Rasterised, lift, rasterise
 from ..rendering.cameras import Cameras
 from ..rendering.local_frame import extent_of
 from .gaussians import Gaussians
-from .photographs import covering
+from .pinholes import covering
 
 _DRAWN_HARMONICS = 16
 """Harmonics a channel that are drawn: those of degree 3, as the rasteriser has no more."""

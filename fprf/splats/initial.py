@@ -16,29 +16,35 @@ from ..datamanagers.images import Image
 from ..datamanagers.scene import ParsedScene
 from ..rendering.cameras import project
 from .gaussians import morton_order
-from .photographs import covering, undistorted
+from .pinholes import covering, undistorted
 
 Doubles = NDArray[np.float64]
-_TINY = float(np.finfo(np.float32).tiny)
+_SMALLEST_DIVISOR = float(np.finfo(np.float32).tiny)
 """Keeps what is divided by above 0, in whatever units a capture is."""
-_ENOUGH = 100
-"""Points that are worth starting from."""
-_WINDOW = 100
-"""Points to either side on the curve among which the nearest are looked for."""
-_FEATURES = 1500
-_NEIGHBOURS = 4
-_PIXELS = 1.5
-_ANGLE = math.radians(1.5)
-"""SIFT features of a view, views that it is matched with, largest error in pixels and least angle between the
-rays.
-"""
-
-_FAR = 10.0
-"""Radius of the surroundings, in that of the cameras and of 95 % of the points."""
-_BLUR = 8
-"""Pixels of a photograph's shorter side once its colours are blurred for the surroundings."""
-_NEIGHBOURING = 8
-"""Directions that views show, nearest to one that none shows, whose mean colour it gets."""
+_MIN_START_POINTS = 100
+"""Points that are worth starting from; by eye."""
+_MAX_SCATTERED_POINTS = 10_000
+"""Random points, at most, where views have no matches; by eye."""
+_NEAREST_PLACES = 100
+"""Places to either side on the curve among which the nearest points are looked for; by eye."""
+_MAX_SIFT_FEATURES = 1500
+"""SIFT features of a view; by eye."""
+_SIFT_CONTRAST = 0.01
+"""Least contrast of a feature: a fourth of OpenCV's, as photographs are small; by eye."""
+_MAX_MATCHED_VIEWS = 4
+"""Views that one is matched with; by eye."""
+_MAX_MATCH_RATIO = 0.85
+"""Distance of the best match over that of the second best, at most (Lowe's ratio); by eye."""
+_MAX_ERROR_PIXELS = 1.5
+"""Largest error of a triangulated point; by eye."""
+_MIN_RAY_ANGLE = math.radians(1.5)
+"""Least angle between the rays of one; by eye: below it a pixel's error moves it far."""
+_SURROUNDINGS_RADIUS = 10.0
+"""Radius of the surroundings, in that of the cameras and of 95 % of the points; by eye."""
+_BLURRED_SIDE_PIXELS = 8
+"""Pixels of a photograph's shorter side once its colours are blurred for the surroundings; by eye."""
+_NEIGHBOURING_DIRECTIONS = 8
+"""Directions that views show, nearest to one that none shows, whose mean colour it gets; by eye."""
 
 
 class Points(NamedTuple):
@@ -52,7 +58,7 @@ def initial_points(
     scene: ParsedScene, images: Mapping[int, Image], count: int, rng: np.random.Generator
 ) -> tuple[Points, str]:
     """At most `count` points, and where they are from; images as they lie, at the size of the cameras."""
-    if scene.points is not None and len(scene.points) >= _ENOUGH:
+    if scene.points is not None and len(scene.points) >= _MIN_START_POINTS:
         position = scene.points.double().numpy()
         position = position[np.isfinite(position).all(1)]
         position = position[np.sort(rng.permutation(len(position))[:count])]
@@ -61,8 +67,8 @@ def initial_points(
         ), "points of the reconstruction"
     points = _matched(scene, images)
     kind = "points matched between views"
-    if len(points.position) < _ENOUGH:
-        points = _scattered(scene, images, min(count, 10_000), rng)
+    if len(points.position) < _MIN_START_POINTS:
+        points = _scattered(scene, images, min(count, _MAX_SCATTERED_POINTS), rng)
         kind = "random points"
     chosen = np.sort(rng.permutation(len(points.position))[:count])
     return Points(points.position[chosen], points.colour[chosen]), kind
@@ -78,18 +84,18 @@ def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points
     centres = scene.cameras.pose[scene.train][:, :, 3].numpy()
     centre = centres.mean(0)
     away = np.linalg.norm(points.position - centre, axis=1)
-    radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), _TINY)
+    radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), _SMALLEST_DIVISOR)
     # Fibonacci's spiral: directions as evenly apart as can be.
     height = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
     level = np.sqrt(1 - height**2)
     direction = np.stack([level * np.cos(turn), level * np.sin(turn), height], 1)
-    position = centre + _FAR * float(radius) * direction
+    position = centre + _SURROUNDINGS_RADIUS * float(radius) * direction
 
     # Blurred, since what is far is drawn by few Gaussians, and a sharp pixel would become a blot.
     def blurred(view: int) -> Image:
         tall, wide = images[view].shape[:2]
-        shrink = _BLUR / min(tall, wide)
+        shrink = _BLURRED_SIDE_PIXELS / min(tall, wide)
         reduced = cv2.resize(
             images[view], (round(wide * shrink), round(tall * shrink)), interpolation=cv2.INTER_AREA
         )
@@ -98,7 +104,7 @@ def surroundings(scene: ParsedScene, images: Mapping[int, Image], points: Points
     colour, seen = _mean_colours(scene, blurred, position)
     if seen.any():
         alike = direction[~seen] @ direction[seen].T
-        nearest = np.argsort(-alike, axis=1)[:, :_NEIGHBOURING]
+        nearest = np.argsort(-alike, axis=1)[:, :_NEIGHBOURING_DIRECTIONS]
         colour[~seen] = colour[seen][nearest].mean(1)
     return Points(position, colour)
 
@@ -115,12 +121,14 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
     order = curve_order(position)
     sorted_ = position[order]
     near = np.full((3, count), np.inf)
-    for step in range(1, min(_WINDOW, count - 1) + 1):
+    for step in range(1, min(_NEAREST_PLACES, count - 1) + 1):
         apart = np.linalg.norm(sorted_[step:] - sorted_[:-step], axis=1)
         for part in (slice(step, None), slice(None, -step)):
             left = apart
             for row in near[:, part]:
-                row[:], left = np.minimum(row, left), np.maximum(row, left)
+                farther = np.maximum(row, left)
+                row[:] = np.minimum(row, left)
+                left = farther
     mean = np.empty(count)
     mean[order] = near.mean(0)
     widest = np.percentile(mean, 99) or 1.0
@@ -131,7 +139,9 @@ def curve_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.
     """Indices along a Morton curve: what is near in space is then near in memory."""
     low = np.percentile(position, 2, axis=0)
     high = np.percentile(position, 98, axis=0)
-    cell = np.clip((position - low) / np.maximum(high - low, _TINY) * 1023, 0, 1023).astype(np.int64)
+    cell = np.clip((position - low) / np.maximum(high - low, _SMALLEST_DIVISOR) * 1023, 0, 1023).astype(
+        np.int64
+    )
     return morton_order(cell)
 
 
@@ -171,7 +181,7 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     """Points triangulated from SIFT matches between neighbouring training views."""
     # Pictures without their lenses: triangulation is that of pinholes.
     views = scene.train.tolist()
-    detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.01)
+    detector = cv2.SIFT.create(nfeatures=_MAX_SIFT_FEATURES, contrastThreshold=_SIFT_CONTRAST)
     cameras = {view: covering(scene.cameras, view, 1e-6) for view in views}
     pictures = {view: undistorted(scene.cameras, view, images[view], cameras[view])[0] for view in views}
     places: dict[int, Doubles] = {}
@@ -190,17 +200,17 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
     axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
     middle = np.mean([*centre.values()], axis=0)
-    spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), _TINY)
+    spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), _SMALLEST_DIVISOR)
     positions = [np.zeros((0, 3))]
     colours = [np.zeros((0, 3), np.float32)]
     done = set()
     for i in features:
-        apart = {
-            j: np.linalg.norm(centre[j] - centre[i]) / spread + 2 * (1 - axis[i] @ axis[j])
-            for j in features
-            if j != i
-        }
-        for j in sorted(apart, key=lambda j: float(apart[j]))[:_NEIGHBOURS]:
+        apart: dict[int, float] = {}
+        for j in features:
+            if j != i:
+                between = np.linalg.norm(centre[j] - centre[i]) / spread
+                apart[j] = float(between + 2 * (1 - axis[i] @ axis[j]))
+        for j in sorted(apart, key=apart.__getitem__)[:_MAX_MATCHED_VIEWS]:
             if (j, i) in done:
                 continue
             done.add((i, j))
@@ -236,7 +246,7 @@ def _pairs(
     alike[rows, best] = -np.inf
     near = np.sqrt(np.maximum(2 - 2 * likeness, 0))
     next_ = np.sqrt(np.maximum(2 - 2 * alike.max(1), 0))
-    kept = (near < 0.85 * next_) & (backwards[best] == rows)
+    kept = (near < _MAX_MATCH_RATIO * next_) & (backwards[best] == rows)
     return rows[kept], best[kept]
 
 
@@ -254,13 +264,13 @@ def _triangulated(
         for matrix, pixel in zip(rays, pixels, strict=True):
             shown = position @ matrix[:, :3].T + matrix[:, 3]
             good &= (shown[:, 2] > 0) & (
-                np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixel, axis=1) < _PIXELS
+                np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixel, axis=1) < _MAX_ERROR_PIXELS
             )
         # ... and the angle between their rays says how far away they are.
         u = position - centres[0]
         v = position - centres[1]
         cosine = (u * v).sum(1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
-    return np.where((good & (cosine < math.cos(_ANGLE)))[:, None], position, np.nan)
+    return np.where((good & (cosine < math.cos(_MIN_RAY_ANGLE)))[:, None], position, np.nan)
 
 
 def _scattered(
@@ -272,7 +282,7 @@ def _scattered(
     # Random pixels of random views, and their colours.
     views = rng.choice(scene.train.numpy(), count)
     centre = scene.cameras.pose[:, :, 3].numpy()
-    spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), _TINY)
+    spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), _SMALLEST_DIVISOR)
     size = scene.cameras.size[views].numpy()
     pixel = rng.random((count, 2)) * size
     colour = np.stack([images[v][int(y), int(x)] for v, (x, y) in zip(views, pixel, strict=True)])

@@ -53,7 +53,7 @@ from ..training.run import Known, Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
 from .initial import Points, curve_order, spacing
-from .photographs import Level
+from .photographs import PhotographLevel
 from .view_corrections import MOVES, ViewCorrections
 
 _START_OPACITY = 0.3
@@ -155,7 +155,7 @@ class Stage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class RunSource:
     """What a run was made of."""
 
     known: Known
@@ -174,12 +174,12 @@ class GaussianLearner(SceneLearner):
     def __init__(
         self,
         config: GaussiansConfig,
-        levels: list[Level],
+        levels: list[PhotographLevel],
         bounds: Bounds,
         *,
         corrections: ViewCorrections | None = None,
         stage: Stage | None = None,
-        source: Source | None = None,
+        source: RunSource | None = None,
         device: torch.device = CPU,
     ) -> None:
         self.config = config
@@ -285,7 +285,7 @@ class GaussianLearner(SceneLearner):
         for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
             self.means[name] = _MEANS_DECAY * self.means.get(name, value) + (1 - _MEANS_DECAY) * value
 
-    def _view(self, level: Level, step: int) -> int:
+    def _view(self, level: PhotographLevel, step: int) -> int:
         """The view of a step. Each epoch sees views once, in an order of its own: sharp ones, and all in
         every eighth.
         """
@@ -300,7 +300,7 @@ class GaussianLearner(SceneLearner):
             every = sharp
         return int(every[np.random.default_rng((self.config.seed, epoch)).permutation(len(every))[turn]])
 
-    def _sharp(self, level: Level) -> list[int]:
+    def _sharp(self, level: PhotographLevel) -> list[int]:
         """Views that are not blurred at a scale; all where only poses or colours are learnt."""
         found: list[int] = []
         for view in level:
@@ -322,7 +322,7 @@ class GaussianLearner(SceneLearner):
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
 
-    def _relocate_and_grow(self, step: int, level: Level, share: float) -> None:
+    def _relocate_and_grow(self, step: int, level: PhotographLevel, share: float) -> None:
         """Split Gaussians where views err: as many as became transparent, which move there, and as the number
         grows by.
         """

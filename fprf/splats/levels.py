@@ -28,35 +28,42 @@ from ..rendering.splines import quaternions, rotations
 from .gaussians import Gaussians, from_rows
 from .initial import curve_order
 
-_CHUNK = 512
-_GROUP = 4
-_LEVELS = 4
-"""Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
-_DEVIATIONS = 3.0
-"""How far a Gaussian reaches, in standard deviations."""
-_FARTHEST = 3.5
-_WIDENED = 2.0
-"""Reach in standard deviations where nothing may be left out, at least sqrt(-2 log MIN_ALPHA)
-(`ops.rasterise`); pixels that drawing widens it by.
+_CHUNK_GAUSSIANS = 512
+"""Gaussians of a chunk; by eye."""
+_MERGED_GAUSSIANS = 4
+"""Gaussians that are merged into one of the next level; by eye."""
+_LEVEL_COUNT = 4
+"""Levels, the finest included; by eye."""
+_REACH_DEVIATIONS = 3.0
+"""How far a Gaussian reaches, in standard deviations: 98.9 % of its weight."""
+_MAX_REACH_DEVIATIONS = 3.5
+"""Reach in standard deviations where nothing may be left out: at least sqrt(-2 log MIN_ALPHA) = 3.33
+(`ops.rasterise`).
 """
-_OPAQUE = 0.995
-_TAIL = 0.02
-"""Share of the means at either end that does not say how long a chunk is."""
-_SPREAD = 0.9
-"""Quantile that says how wide a chunk is, and how far apart is what a level merges."""
-_AT_ONCE = 64
-"""Chunks that are recoloured together."""
-_PART = 1 << 17
+_WIDENED_PIXELS = 2.0
+"""Pixels that drawing widens that reach by."""
+_MAX_MERGED_OPACITY = 0.995
+"""Largest opacity of what is merged: beyond it there is no logit worth having; by eye."""
+_STRAY_SHARE = 0.02
+"""Share of the means at either end that does not say how long a chunk is; by eye."""
+_WIDTH_QUANTILE = 0.9
+"""Quantile that says how wide a chunk is, and how far apart is what a level merges; by eye."""
+_RECOLOURED_CHUNKS = 64
+"""Chunks that are recoloured together; by eye: bounds the memory."""
+_WRITTEN_GAUSSIANS = 1 << 17
 """Gaussians that are in memory at a time while levels are written."""
-_KEPT = 1 << 28
-"""Bytes of colours that a look keeps of chunks it has drawn."""
-_TABLES = "begin", "spread", "centre", "radius", "core"
-_FILE = "rows.bin"
-_FORMAT = 2
-_LENGTH = 8
-"""File of a run's levels: rows, their order (int32), an .npz archive of the tables, the bytes of that archive
-as a number of this many bytes; all little endian.
-"""
+_MAX_COLOUR_BYTES = 1 << 28
+"""Bytes of colours that a look keeps of chunks it has drawn; by eye."""
+
+# File of a run's levels: rows, their order (int32), an .npz archive of the tables, the bytes of that archive as
+# a number; all little endian.
+
+_LEVELS_FILE = "rows.bin"
+_LEVELS_VERSION = 2
+"""Version of that file: another one is written anew."""
+_TABLE_NAMES = ("begin", "spread", "centre", "radius", "core")
+_NUMBER_BYTES = 8
+"""Bytes of the number at its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +141,13 @@ class StyledLevels:
         new = np.array([key not in self._colours for key in keys], bool)
         for k in np.unique(level[new]):
             here = chunks[new & (level == k)]
-            for first in range(0, len(here), _AT_ONCE):
-                self._add(here[first : first + _AT_ONCE], int(k))
+            for first in range(0, len(here), _RECOLOURED_CHUNKS):
+                self._add(here[first : first + _RECOLOURED_CHUNKS], int(k))
         # What was drawn last stays longest.
         parts = [self._colours[key] for key in keys]
         for key in keys:
             self._colours.move_to_end(key)
-        while self._bytes > _KEPT:
+        while self._bytes > _MAX_COLOUR_BYTES:
             self._bytes -= self._colours.popitem(last=False)[1].nbytes
         return shown.recoloured(torch.cat(parts)) if parts else shown
 
@@ -151,7 +158,7 @@ class StyledLevels:
         levels = self._levels
         gaussians = levels.gather(chunks, np.zeros_like(chunks))
         index = np.concatenate(
-            [levels.order[_CHUNK * chunk : _CHUNK * (chunk + 1)] for chunk in chunks]
+            [levels.order[_CHUNK_GAUSSIANS * chunk : _CHUNK_GAUSSIANS * (chunk + 1)] for chunk in chunks]
         ).astype(np.int64)
         harmonics = self._recolour(gaussians, torch.from_numpy(index))
         for k in range(level):
@@ -191,9 +198,9 @@ def seen_by(gaussians: Gaussians, camera: Pinhole) -> Annotated[Tensor, "M"]:
     means = gaussians.means.double().numpy()
     pose = camera.world_to_camera.double()
     away = np.linalg.norm(means + (pose[:3, :3].T @ pose[:3, 3]).numpy(), axis=1)
-    widened = _WIDENED / float(min(camera.intrinsics[0, 0], camera.intrinsics[1, 1])) * away
+    widened = _WIDENED_PIXELS / float(min(camera.intrinsics[0, 0], camera.intrinsics[1, 1])) * away
     _, seen = in_view(
-        camera, means, _FARTHEST * gaussians.log_scales.double().amax(1).exp().numpy() + widened
+        camera, means, _MAX_REACH_DEVIATIONS * gaussians.log_scales.double().amax(1).exp().numpy() + widened
     )
     return torch.from_numpy(np.flatnonzero(seen))
 
@@ -205,26 +212,26 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
     order = torch.from_numpy(np.concatenate(_chunks(position, np.arange(len(position)))))
     levels = [gaussians.select(order)]
     sizes = [np.full(len(order), 0.0)]
-    for _ in range(_LEVELS - 1):
+    for _ in range(_LEVEL_COUNT - 1):
         merged, apart = _merged(levels[-1])
         before = sizes[-1]
         # What lies apart in a level was apart already in the one before.
-        fill = np.pad(before, (0, -len(before) % _GROUP)).reshape(-1, _GROUP).max(1)
+        fill = np.pad(before, (0, -len(before) % _MERGED_GAUSSIANS)).reshape(-1, _MERGED_GAUSSIANS).max(1)
         levels.append(merged)
         sizes.append(np.hypot(apart, fill))
     # Of each chunk the rows of its levels, one after the other, and the balls around what it shows and around
     # its means.
-    count = -(-len(order) // _CHUNK)
-    width = [_CHUNK // _GROUP**k for k in range(_LEVELS)]
+    count = -(-len(order) // _CHUNK_GAUSSIANS)
+    width = [_CHUNK_GAUSSIANS // _MERGED_GAUSSIANS**k for k in range(_LEVEL_COUNT)]
     tables = [level.rows.numpy() for level in levels]
     parts = []
-    begin = np.zeros((count, _LEVELS + 1), np.int64)
-    spread = np.zeros((count, _LEVELS))
+    begin = np.zeros((count, _LEVEL_COUNT + 1), np.int64)
+    spread = np.zeros((count, _LEVEL_COUNT))
     centre = np.zeros((count, 3))
     radius = np.zeros(count)
     core = np.zeros(count)
     at = 0
-    reach = _DEVIATIONS * np.exp(levels[0].log_scales.double().amax(1).numpy())
+    reach = _REACH_DEVIATIONS * np.exp(levels[0].log_scales.double().amax(1).numpy())
     means = levels[0].means.double().numpy()
     for chunk in range(count):
         for k, (table, each) in enumerate(zip(tables, width, strict=True)):
@@ -232,13 +239,13 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
             begin[chunk, k] = at
             parts.append(table[part])
             at += len(table[part])
-            spread[chunk, k] = np.quantile(sizes[k][part], _SPREAD)
+            spread[chunk, k] = np.quantile(sizes[k][part], _WIDTH_QUANTILE)
         begin[chunk, -1] = at
-        own = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
+        own = slice(chunk * _CHUNK_GAUSSIANS, (chunk + 1) * _CHUNK_GAUSSIANS)
         centre[chunk] = np.median(means[own], axis=0)
         away = np.linalg.norm(means[own] - centre[chunk], axis=1)
         radius[chunk] = (away + reach[own]).max()
-        core[chunk] = np.quantile(away, _SPREAD)
+        core[chunk] = np.quantile(away, _WIDTH_QUANTILE)
     return Levels(np.concatenate(parts), begin, spread, centre, radius, core, order.numpy().astype(np.int32))
 
 
@@ -252,10 +259,10 @@ def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
     columns: list[tuple[NDArray[Any], ...]] = []
     orders: list[NDArray[np.int32]] = []
     written = 0
-    with atomic_path(folder / _FILE) as temporary, temporary.open("wb") as file:
-        for first in range(0, len(gaussians), _PART):
+    with atomic_path(folder / _LEVELS_FILE) as temporary, temporary.open("wb") as file:
+        for first in range(0, len(gaussians), _WRITTEN_GAUSSIANS):
             levels = make_levels_of_detail(
-                gaussians.select(torch.arange(first, min(first + _PART, len(gaussians))))
+                gaussians.select(torch.arange(first, min(first + _WRITTEN_GAUSSIANS, len(gaussians))))
             )
             file.write(levels.rows.tobytes())
             columns.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
@@ -263,32 +270,37 @@ def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
             written += len(levels.rows)
         for order in orders:
             file.write(order.tobytes())
-        parts = dict(
-            zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True)
-        )
+        parts = {}
+        for name, column in zip(_TABLE_NAMES, zip(*columns, strict=True), strict=True):
+            parts[name] = np.concatenate(column)
         tables = io.BytesIO()
         width = np.array(levels.rows.shape[1])
         count = np.array(len(gaussians))
         np.savez(
-            tables, allow_pickle=False, key=np.array(f"{_FORMAT} {key}"), width=width, count=count, **parts
+            tables,
+            allow_pickle=False,
+            key=np.array(f"{_LEVELS_VERSION} {key}"),
+            width=width,
+            count=count,
+            **parts,
         )
-        file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_LENGTH, "little"))
+        file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_NUMBER_BYTES, "little"))
 
 
 def open_levels(folder: Path, key: str) -> Levels | None:
     """Levels mapped from a file; None where there are none of this key."""
     try:
-        with (folder / _FILE).open("rb") as file:
+        with (folder / _LEVELS_FILE).open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         # From the end: the length of the archive, the archive, and what lies before it.
-        end = len(mapped) - _LENGTH
+        end = len(mapped) - _NUMBER_BYTES
         begin = end - int.from_bytes(mapped[end:], "little")
         if begin < 0:
             return None
         with np.load(io.BytesIO(mapped[begin:end])) as tables:
-            if str(tables["key"]) != f"{_FORMAT} {key}":
+            if str(tables["key"]) != f"{_LEVELS_VERSION} {key}":
                 return None
-            parts = {name: tables[name] for name in _TABLES}
+            parts = {name: tables[name] for name in _TABLE_NAMES}
             count = int(tables["count"])
             rows = np.frombuffer(mapped, np.float32, begin // 4 - count).reshape(-1, int(tables["width"]))
             order = np.frombuffer(mapped, np.int32, count, begin - 4 * count)
@@ -303,13 +315,13 @@ def _chunks(
     """Indices in chunks, all but the last one full: halved across the longest side, then along a Morton
     curve.
     """
-    if len(index) <= _CHUNK:
+    if len(index) <= _CHUNK_GAUSSIANS:
         if len(index):
             return [index[curve_order(position[index])]]
         return []
     own = position[index]
-    axis = int((np.quantile(own, 1 - _TAIL, axis=0) - np.quantile(own, _TAIL, axis=0)).argmax())
-    half = max(1, len(index) // (2 * _CHUNK)) * _CHUNK
+    axis = int((np.quantile(own, 1 - _STRAY_SHARE, axis=0) - np.quantile(own, _STRAY_SHARE, axis=0)).argmax())
+    half = max(1, len(index) // (2 * _CHUNK_GAUSSIANS)) * _CHUNK_GAUSSIANS
     order = np.argpartition(own[:, axis], half)
     return _chunks(position, index[order[:half]]) + _chunks(position, index[order[half:]])
 
@@ -317,34 +329,34 @@ def _chunks(
 def _shares(
     gaussians: Gaussians,
 ) -> tuple[Annotated[Tensor, "M*4"], Annotated[Tensor, "M 4 1"], Annotated[Tensor, "M 4 1"]]:
-    """Numbers of the Gaussians that are merged, `_GROUP` by `_GROUP`, their shares of what they become, and
-    their weights.
+    """Numbers of the Gaussians that are merged, `_MERGED_GAUSSIANS` after each other, their shares of what
+    they become, and their weights.
     """
-    missing = -len(gaussians) % _GROUP
+    missing = -len(gaussians) % _MERGED_GAUSSIANS
     index = torch.arange(len(gaussians) + missing).clamp_max(len(gaussians) - 1)
     areas = gaussians.log_scales.double().exp().topk(2, dim=1).values.prod(1)
     weight = (gaussians.opacities.double() * areas)[index].clamp_min(1e-30)
     if missing:
         weight[-missing:] = 0
-    weight = weight.view(-1, _GROUP, 1)
+    weight = weight.view(-1, _MERGED_GAUSSIANS, 1)
     return index, weight / weight.sum(1, keepdim=True), weight
 
 
 def _merged_harmonics(
     harmonics: Annotated[Tensor, "N K 3"], index: Annotated[Tensor, "M*4"], share: Annotated[Tensor, "M 4 1"]
 ) -> Annotated[Tensor, "M K 3"]:
-    return (share[..., None] * harmonics.double()[index].view(len(share), _GROUP, -1, 3)).sum(1)
+    return (share[..., None] * harmonics.double()[index].view(len(share), _MERGED_GAUSSIANS, -1, 3)).sum(1)
 
 
 def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
-    """Each `_GROUP` neighbours as one, and the standard deviation of their means along its longest axis."""
+    """Each `_MERGED_GAUSSIANS` neighbours as one, and the standard deviation of their means along its longest axis."""
     # Mean and covariance of a mixture: the mean of the covariances, and the covariance of the means.
     index, share, weight = _shares(gaussians)
     scales = gaussians.log_scales.double().exp()
-    means = gaussians.means.double()[index].view(-1, _GROUP, 3)
+    means = gaussians.means.double()[index].view(-1, _MERGED_GAUSSIANS, 3)
     mean = (share * means).sum(1)
     axes = rotations(gaussians.quaternions.double()) * scales[:, None]
-    covariance = (axes @ axes.mT)[index].view(-1, _GROUP, 3, 3)
+    covariance = (axes @ axes.mT)[index].view(-1, _MERGED_GAUSSIANS, 3, 3)
     away = means - mean[:, None]
     between = (share[..., None] * away[..., :, None] * away[..., None, :]).sum(1)
     # Its axes are a rotation, not a reflection; opacity times area is that of all of them together.
@@ -352,7 +364,7 @@ def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     vectors = vectors * torch.linalg.det(vectors).sign()[:, None, None]
     values = values.clamp_min(1e-20)
     area = values[:, 1:].prod(1).sqrt()
-    opacity = (weight.sum((1, 2)) / area).clamp(1e-6, _OPAQUE)
+    opacity = (weight.sum((1, 2)) / area).clamp(1e-6, _MAX_MERGED_OPACITY)
     harmonics = _merged_harmonics(gaussians.harmonics, index, share)
     parts = (mean, quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
     apart = torch.linalg.eigvalsh(between)[:, -1].clamp_min(0).sqrt()

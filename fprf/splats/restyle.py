@@ -18,13 +18,13 @@ from ..ops.harmonics import Directions, recoloured, spherical_harmonics
 from ..style.light import luma
 from ..style.look import Restyle, place_weight
 
-_DIRECTIONS = 48
-"""In which harmonics are evaluated to find where renderers cut their colours."""
-_ROWS = 1 << 15
+_CUT_DIRECTIONS = 48
+"""Directions in which harmonics are evaluated to find where renderers cut their colours; by eye."""
+_RECOLOURED_GAUSSIANS = 1 << 15
 """Gaussians at a time: bounds the memory."""
 
 
-class Colours(Encoder):
+class ColourEncoder(Encoder):
     """Colours as content features."""
 
     @property
@@ -55,8 +55,8 @@ def restyled_harmonics(
     out = torch.empty_like(before)
     kept = sum(part.share * part.luminance for part in look.parts)
     directions = all_around(before.shape[1])
-    for start in range(0, len(before), _ROWS):
-        rows = slice(start, start + _ROWS)
+    for start in range(0, len(before), _RECOLOURED_GAUSSIANS):
+        rows = slice(start, start + _RECOLOURED_GAUSSIANS)
         # The change against the identity, A and below it b of each Gaussian (c' = c + c A + b), and how
         # strongly the look acts.
         features = semantic[rows].to(means)
@@ -86,8 +86,8 @@ def restyled_harmonics(
 @cache
 def all_around(bands: int) -> Directions:
     """Directions all around, for that many bands; no more than those of degree 3."""
-    at = torch.arange(_DIRECTIONS) + 0.5
-    height = 1 - 2 * at / _DIRECTIONS
+    at = torch.arange(_CUT_DIRECTIONS) + 0.5
+    height = 1 - 2 * at / _CUT_DIRECTIONS
     turn = at * (math.pi * (5**0.5 - 1))
     flat = (1 - height.square()).sqrt()
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)

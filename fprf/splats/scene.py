@@ -29,14 +29,15 @@ from ..types import Origin, View
 from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
-from .photographs import cover, distorted
-from .restyle import Colours, restyled_harmonics
+from .pinholes import cover, distorted
+from .restyle import ColourEncoder, restyled_harmonics
 from .semantics import Semantics
 
 CPU = torch.device("cpu")
-_ROWS = 1 << 14
-_CHANNELS = 128
-"""Gaussians whose values are found, and channels that are drawn, at a time: bounds the memory."""
+_PAINTED_GAUSSIANS = 1 << 14
+"""Gaussians whose values are found at a time: bounds the memory."""
+_PAINTED_CHANNELS = 128
+"""Channels that are drawn at a time: bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,8 @@ class SplatScene(Scene):
     """Fits poses of views to their photographs (`fit_poses`); None = there are no photographs."""
     asked: torch.device = CPU
     """Device to draw views on: the CPU, or a CUDA device if gsplat draws there."""
+    copied: Gaussians | None = None
+    """All Gaussians in the scene's look, where they are drawn, if another scene has them already."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,7 +116,7 @@ class SplatScene(Scene):
     @cached_property
     def _there(self) -> Gaussians:
         """`shown`, where it is drawn."""
-        return self.shown.to(self.drawn_on)
+        return self.shown.to(self.drawn_on) if self.copied is None else self.copied
 
     def part(self, rows: slice) -> Gaussians:
         """Some of the Gaussians in the scene's look."""
@@ -205,10 +208,12 @@ class SplatScene(Scene):
         channels = values(features[:1].float(), means[:1]).shape[1]
         shown = torch.empty(len(means), channels)
         out = torch.empty(len(at), channels)
-        for start in range(0, len(means), _ROWS):
-            rows = slice(start, start + _ROWS)
+        for start in range(0, len(means), _PAINTED_GAUSSIANS):
+            rows = slice(start, start + _PAINTED_GAUSSIANS)
             shown[rows] = values(features[rows].float(), means[rows])
-        for some, into in zip(torch.split(shown, _CHANNELS, 1), torch.split(out, _CHANNELS, 1), strict=True):
+        for some, into in zip(
+            torch.split(shown, _PAINTED_CHANNELS, 1), torch.split(out, _PAINTED_CHANNELS, 1), strict=True
+        ):
             drawn = draw(self.gaussians, camera, antialiased=self.antialiased, features=some)
             # What is drawn is weighted by opacity.
             opacity = drawn.opacity.flatten()[at]
@@ -220,10 +225,9 @@ class SplatScene(Scene):
             return self
         # Of a view that was held out, what its exposure says.
         red, green, blue = self.tones(torch.tensor([view]))[0].tolist()
-        taken = replace(self, tone=(red, green, blue))
-        if self.merged is None:  # the same Gaussians, recoloured and copied once
-            vars(taken)["_there"] = self._there
-        return taken
+        # The same Gaussians, recoloured and copied once; levels of detail are kept on their own.
+        copied = self._there if self.merged is None else None
+        return replace(self, tone=(red, green, blue), copied=copied)
 
     def fit_poses(
         self, captured: ParsedScene, views: Sequence[int], progress: Callable[[int, int, str], None]
@@ -239,7 +243,7 @@ class SplatScene(Scene):
 
     def restyled(self, look: Restyle | None) -> "SplatScene":
         """The same Gaussians in other colours."""
-        return replace(self, look=None if look is None or look.idle else look)
+        return replace(self, look=None if look is None or look.idle else look, copied=None)
 
     def cached(self, cameras: Cameras, view: int) -> "GaussianView":
         """A view, of which nothing is kept: drawing it again takes milliseconds."""
@@ -259,7 +263,7 @@ class SplatScene(Scene):
         missing.
         """
         found = self.found()
-        return Encoders(Colours(), self.encoder(), found.basis, found.style, longest=self.longest)
+        return Encoders(ColourEncoder(), self.encoder(), found.basis, found.style, longest=self.longest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,29 +36,29 @@ from ..style.scene_style import to_tensors as style_tensors
 from .drawing import draw
 from .gaussians import MAX_BULK_DISTANCE, Gaussians, bulk_of, cells_of
 from .levels import seen_by
-from .photographs import camera_of
+from .pinholes import camera_of
 
-_CHANNELS = 31
+_SEMANTIC_COMPONENTS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors
 of eight.
 """
-_SOLID = 0.5
-"""Pixels and cells less opaque than this say nothing about the scene."""
-_TRUST = 4.0
-"""Pixels count by this power of their opacity: a soft edge would carry the backdrop's semantics."""
-_SAMPLES = 65_536
-"""Pixels of all views together that statistics are taken of, about."""
-_COARSER = 2
+_MIN_VIEW_OPACITY = 0.5
+"""Pixels and cells less opaque than this say nothing about the scene; by eye."""
+_TRUST_POWER = 4.0
+"""Pixels count by this power of their opacity: a soft edge would carry the backdrop's semantics; by eye."""
+_STATISTICS_PIXELS = 65_536
+"""Pixels of all views together that statistics are taken of, about; by eye."""
+_FEATURE_REDUCTION = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
-_TOGETHER = 8
+_SPREAD_COMPONENTS = 8
 """Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
-_NEIGHBOURS = 1.0
+_NEIGHBOURHOOD_PIXELS = 1.0
+"""Pixels that the nearest neighbourhood counts for, and half as many each that is twice as wide; by eye."""
 _NEIGHBOURHOODS = 8
-_EDGE = 0.02
-"""Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the
-edge of the nearest one, as a share of the spread of the positions.
-"""
-_VIEWS_AT_ONCE = 4
+"""Neighbourhoods of a Gaussian, each twice as wide as the one before; by eye."""
+_NEIGHBOURHOOD_EDGE_SHARE = 0.02
+"""Edge of the nearest one, as a share of the spread of the positions; by eye."""
+_MAX_VIEWS_AT_ONCE = 4
 """Views that are looked at at the same time, at most: each takes the memory of what it draws."""
 _Result = TypeVar("_Result")
 
@@ -114,7 +114,7 @@ def find_semantics(
         progress(view, total)
         pictures.append(picture)
         cover = interpolate(picture.opacity[None, None], picture.maps.shape[1:], mode="area")[0, 0]
-        solid.append(picture.maps[:, cover > _SOLID].T)
+        solid.append(picture.maps[:, cover > _MIN_VIEW_OPACITY].T)
     if not any(len(each) for each in solid):
         raise DataError("nothing in the capture is opaque enough to be seen; it cannot be restyled")
 
@@ -122,11 +122,14 @@ def find_semantics(
     #    photographs pass. Its window
     # is a share of the root of the area: one of the shorter side of an upright view hardly covers two of the
     # encoder's cells, and a fir before the sky was half sky.
-    basis = fit_basis(torch.cat(solid), _CHANNELS)
+    basis = fit_basis(torch.cat(solid), _SEMANTIC_COMPONENTS)
     guided = GuidedConfig()
-    reduced = cameras.scaled(_COARSER)
+    reduced = cameras.scaled(_FEATURE_REDUCTION)
 
-    every = max(1, sum(picture.opacity.numel() for picture in pictures) // (_SAMPLES * _COARSER**2))
+    every = max(
+        1,
+        sum(picture.opacity.numel() for picture in pictures) // (_STATISTICS_PIXELS * _FEATURE_REDUCTION**2),
+    )
 
     def carried(view: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """Numbers of the Gaussians that the view shows, sums of features and of weights over their pixels [M
@@ -144,18 +147,20 @@ def find_semantics(
         radius = round(guided.radius * math.sqrt(width * height))
         fine = upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
-        colour = image[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1)
-        seen = opacity[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1)
-        at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
+        colour = image[::_FEATURE_REDUCTION, ::_FEATURE_REDUCTION][:height, :width].flatten(0, 1)
+        seen = opacity[::_FEATURE_REDUCTION, ::_FEATURE_REDUCTION][:height, :width].flatten(0, 1)
+        at = (seen[::every] > _MIN_VIEW_OPACITY).nonzero()[:, 0] * every
         sample = (colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]
         # Neighbours along rows: where both are solid, with their colours without what is behind them.
-        solid = coarse[..., 3] > _SOLID
+        solid = coarse[..., 3] > _MIN_VIEW_OPACITY
         pair = (solid[:, :-1] & solid[:, 1:]).flatten().nonzero()[::every, 0]
-        shown = torch.cat([(coarse[..., :3] / coarse[..., 3:].clamp_min(_SOLID)).clamp(0, 1), fine], 2)
+        shown = torch.cat(
+            [(coarse[..., :3] / coarse[..., 3:].clamp_min(_MIN_VIEW_OPACITY)).clamp(0, 1), fine], 2
+        )
         ends = torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1)
         # Each Gaussian that the camera may see takes the sum over its pixels, by its weights there.
         camera = camera_of(reduced, view, near)
-        trust = coarse[..., 3:] ** _TRUST
+        trust = coarse[..., 3:] ** _TRUST_POWER
         index = seen_by(gaussians, camera)
         shape = (
             gaussians.means[index],
@@ -186,8 +191,8 @@ def find_semantics(
         met = torch.cat(pairs)
         style = style._replace(contacts=region_contacts(style, met[..., 3:], met[..., :3]))
     # As many pixels as the views have at their own size.
-    sums *= _COARSER**2
-    weights *= _COARSER**2
+    sums *= _FEATURE_REDUCTION**2
+    weights *= _FEATURE_REDUCTION**2
     features = _spread(gaussians.means, sums, weights, style.semantic_mean)
     return Semantics(style, basis, features, encoder.identity)
 
@@ -199,7 +204,7 @@ def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Res
     other most of the time. At most one more is under way than there are threads, so memory is bounded.
     """
     before = torch.get_num_threads()
-    threads = min(before, _VIEWS_AT_ONCE)
+    threads = min(before, _MAX_VIEWS_AT_ONCE)
     if threads == 1:
         yield from map(function, range(count))
         return
@@ -242,7 +247,7 @@ def _spread(
     # Neither stray Gaussians nor the distance from the origin decide how large neighbourhoods are, nor where
     # they begin.
     near = points[torch.from_numpy(bulk_of(points.numpy()).apart <= MAX_BULK_DISTANCE)].double()
-    edge = _EDGE * float(near.var(0, correction=0).mean().sqrt())
+    edge = _NEIGHBOURHOOD_EDGE_SHARE * float(near.var(0, correction=0).mean().sqrt())
     # Each level divides space into boxes twice as wide; a box counts for at most so many pixels, however much
     # was seen there.
     for level in range(_NEIGHBOURHOODS):
@@ -250,12 +255,12 @@ def _spread(
             1
         ]
         weight = sums.new_zeros(int(box.max()) + 1).index_add_(0, box, mass)
-        share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
+        share = weight.clamp_max(_NEIGHBOURHOOD_PIXELS * 0.5**level) / weight.clamp_min(1e-12)
         trust += (weight * share)[box]
         levels.append((box.int(), share))
     # Means of a point's own pixels and of its box in each level, by these weights.
     out = torch.empty(sums.shape, dtype=torch.float16)
-    for some in torch.split(torch.arange(sums.shape[1]), _TOGETHER):
+    for some in torch.split(torch.arange(sums.shape[1]), _SPREAD_COMPONENTS):
         part = sums[:, some]
         mean = part.clone()
         for box, share in levels:

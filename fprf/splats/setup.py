@@ -28,7 +28,7 @@ from ..training.prepare import exposure_of, facts_of
 from ..training.run import known_of
 from .config import GaussiansConfig
 from .initial import Points, initial_points, projected, surroundings
-from .learner import CPU, Bounds, GaussianLearner, LimitWidths, Source
+from .learner import CPU, Bounds, GaussianLearner, LimitWidths, RunSource
 from .photographs import load_photographs, make_levels
 from .view_corrections import ViewCorrections
 
@@ -109,7 +109,7 @@ def build(
             limit_widths=limit_widths(scene, near, cells=config.cells.cuts, sphere=sphere),
         ),
         corrections=ViewCorrections(tones_of(facts), poses_of(facts, 1.0)),
-        source=Source(known=known_of(scene, config.data, facts), points=origin),
+        source=RunSource(known=known_of(scene, config.data, facts), points=origin),
         device=device,
     )
     learner.begin_at(points, draw, far)
@@ -147,10 +147,8 @@ def limit_widths(
     `near` is drawn.
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
-    if cells:
-        share, every = (_MAX_WIDTH_IN_CELLS, _WIDTH_EVERY_STEPS_IN_CELLS)
-    else:
-        share, every = (_MAX_WIDTH, _WIDTH_EVERY_STEPS)
+    share = _MAX_WIDTH_IN_CELLS if cells else _MAX_WIDTH
+    every = _WIDTH_EVERY_STEPS_IN_CELLS if cells else _WIDTH_EVERY_STEPS
 
     def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.

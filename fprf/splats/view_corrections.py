@@ -19,7 +19,7 @@ _GAIN_RATE = 5e-3
 """Learning rate of the logarithms of a view's factors, whenever it is seen; by eye."""
 _EXPONENT_RATE = 2e-3
 """Learning rate of the exponent that all views share; by eye."""
-_FINAL_RATE_SHARE = 0.1
+_FINAL_CORRECTION_SHARE = 0.1
 """What is left of these rates, and of that of poses, at the end of the training; by eye."""
 _FIRST_DECAY = 0.9
 """Decay of Adam's first moment: that of Kingma and Ba 2015."""
@@ -92,7 +92,7 @@ class ViewCorrections:
         # The factor is exp(gain + exponent * exposure): a slope by the exponent is that by the gain, times
         # the exposure.
         pull = torch.from_numpy(measured.pull)
-        rate = rate * _FINAL_RATE_SHARE**share
+        rate = rate * _FINAL_CORRECTION_SHARE**share
         self.states["tones.gain"].row(view).step(pull, _GAIN_RATE * rate)
         if self.tones.exponent.requires_grad:
             slope = pull.sum() * self.tones.exposure[view]
@@ -108,7 +108,7 @@ class ViewCorrections:
         gradient = torch.from_numpy(measured.of_camera)
         of_turn = torch.from_numpy(target.axes).T @ gradient[:3]
         slope = torch.cat([of_turn, self.poses.reach * gradient[3:]]).float()
-        self.states["poses.offset"].row(view).step(slope, rate * _FINAL_RATE_SHARE**share)
+        self.states["poses.offset"].row(view).step(slope, rate * _FINAL_CORRECTION_SHARE**share)
 
     def tensors(self) -> dict[str, Tensor]:
         """Copies for a checkpoint."""

@@ -26,7 +26,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
 from .drawing import clip_distance, draw
 from .gaussians import MAX_BULK_DISTANCE, Gaussians, bulk_of
-from .photographs import camera_of
+from .pinholes import camera_of
 
 # When a capture counts as a room.
 
@@ -110,7 +110,7 @@ _MAX_EYE_HEIGHT = 0.67
 """Share of the box's height in which a camera stands: nobody holds one in the upper third."""
 _MAX_PLACES = 12
 """Places that are tried."""
-_TURNS = 8
+_DIRECTIONS_PER_PLACE = 8
 """Directions looked in at each."""
 _ROOM_DROP = 0.1
 """How far these point down, as a slope."""
@@ -358,8 +358,8 @@ class _ViewSearch:
         if not len(free):
             return None
         places = _farthest_apart(free, self.ends.mean(1), _MAX_PLACES)
-        eye = places.repeat_interleave(_TURNS, 0)
-        ahead = _around(self.up, _TURNS) - _ROOM_DROP * self.up
+        eye = places.repeat_interleave(_DIRECTIONS_PER_PLACE, 0)
+        ahead = _around(self.up, _DIRECTIONS_PER_PLACE) - _ROOM_DROP * self.up
         cameras = self.looking(eye, eye + ahead.repeat(len(places), 1), _ROOM_FOV_DEGREES)
         spread = float(self.coarse.means.double().var(0, correction=0).sum().sqrt())
         close = torch.full((len(cameras),), _ROOM_CLOSE_SHARE * spread)
@@ -367,10 +367,10 @@ class _ViewSearch:
         # most of them.
         every_other = torch.arange(0, len(cameras), 2)
         _, filled = self.judged(cameras.select(every_other), close[every_other])
-        enclosed = filled.view(len(places), _TURNS // 2).mean(1)
+        enclosed = filled.view(len(places), _DIRECTIONS_PER_PLACE // 2).mean(1)
         if float(enclosed.quantile(_ENCLOSED_QUANTILE)) < min_enclosed:
             return None
-        chosen = (enclosed >= min_enclosed).repeat_interleave(_TURNS)
+        chosen = (enclosed >= min_enclosed).repeat_interleave(_DIRECTIONS_PER_PLACE)
         cameras = cameras.select(chosen)
         worth, _ = self.judged(cameras, close[chosen])
         return cameras, worth

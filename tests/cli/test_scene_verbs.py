@@ -28,7 +28,7 @@ from fprf.io.overwriting import Origin
 from fprf.rendering.paths import make_path, write_camera_path
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.training.history import History
 
 CAPTURED = ["--path", "dataset", "--split", "test"]

@@ -13,7 +13,7 @@ from torch import Tensor
 from fprf.datamanagers.images import Image
 from fprf.datamanagers.scene import GAMMA, ParsedScene, exposures_differ, find_sightings, with_exposure
 from fprf.rendering.cameras import Cameras, ideal_cameras
-from fprf.splats.photographs import blurred_views, detail
+from fprf.splats.blur import blurred_views, detail
 
 VIEWS = 12
 SIDE = 128

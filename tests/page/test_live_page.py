@@ -93,7 +93,7 @@ def test_a_field_is_restyled_compared_picked_and_filmed(run: Path, world: World)
         found = state(page, "state.shelf.length === 1")
         assert found["shelf"][0]["name"] == "dusk.png" and found["shelf"][0]["weight"] == 1
         page.locator("#wiping").click()
-        page.wait_for_function("() => fprf.live.last.captured")
+        page.wait_for_function("() => fprf.live.field.last.captured")
         box = page.locator("#line").bounding_box()
         page.mouse.move(box["x"] + 18, 300)
         page.mouse.down()

@@ -16,7 +16,7 @@ from splat_ball import ball
 
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.drawing import draw
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.splats.scene import SplatScene
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

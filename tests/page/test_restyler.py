@@ -109,7 +109,9 @@ class Watched(ScenePainter):
     ) -> list[Any]:
         self.pictures.clear()
         camera = camera_of(self._scene, view)
-        for _ in self.render(client, messages.View(camera=camera, captured=captured), shown or Shown(Look())):
+        for _ in self.render(
+            client, messages.ViewRequest(camera=camera, captured=captured), shown or Shown(Look())
+        ):
             pass
         return list(self.pictures)
 
@@ -245,7 +247,8 @@ def test_a_film_that_cannot_be_written_leaves_room_for_the_next(
     session.handle(1, messages.Film(seconds=0.2))
     with pytest.raises(UsageError, match="one is being made"):
         session.handle(1, messages.Film(seconds=0.2))
-    until(lambda: session.state.film[2] is not None)
-    done, total, path = session.state.film
-    assert path is not None and path.stat().st_size > 500 and done == total == 6
+    until(lambda: session.state.film.path is not None)
+    film = session.state.film
+    path = film.path
+    assert path is not None and path.stat().st_size > 500 and film.done == film.total == 6
     assert path.parent.parent == session.viewed.root / "films" and (path.parent / "keys.json").is_file()

@@ -95,8 +95,8 @@ class Probe(ViewerServer):
 
 @pytest.fixture
 def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[ViewerServer]:
-    monkeypatch.setattr(server, "_MAX_BODY", 100_000)
-    monkeypatch.setattr(server, "_TIMEOUT", 0.5)
+    monkeypatch.setattr(server, "_MAX_BODY_BYTES", 100_000)
+    monkeypatch.setattr(server, "_MAX_WAIT_SECONDS", 0.5)
     with Probe(HERE, 0) as found:
         yield found
 
@@ -280,7 +280,7 @@ def test_websockets_of_other_sites_and_too_many_are_refused(
     assert told.value.response.status_code == 403
     with opened(http, origin=f"http://127.0.0.1:{http.port}") as client:
         client.recv()
-        monkeypatch.setattr(server, "_PAGES", 1)
+        monkeypatch.setattr(server, "_MAX_PAGES", 1)
         with pytest.raises(InvalidStatus), opened(http):
             pass
     assert status(http, "GET /") == 200

@@ -17,7 +17,7 @@ from fprf.page.messages import SHELF
 from fprf.page.render_worker import Steps
 from fprf.page.server import Access, ViewerServer
 from fprf.page.session import Session
-from fprf.page.state import State
+from fprf.page.state import SharedState
 from fprf.splats.files import read_capture
 
 
@@ -37,7 +37,7 @@ def test_a_photograph_restyles_what_every_client_of_a_field_sees(
     session: Session, listener: Listener, world: World
 ) -> None:
     for client in (1, 2):
-        session.handle(client, messages.View(camera=camera_of(session.viewed.scene, client)))
+        session.handle(client, messages.ViewRequest(camera=camera_of(session.viewed.scene, client)))
     sharp = lambda client: [each for each in listener.pictures(client) if max(each.shape) == 64]  # noqa: E731
     listener.until(lambda: all(sharp(client) for client in (1, 2)))
     plain = {client: sharp(client)[0] for client in (1, 2)}
@@ -48,7 +48,7 @@ def test_a_photograph_restyles_what_every_client_of_a_field_sees(
         assert abs(sharp(client)[-1].astype(int) - plain[client]).mean() > 2
     again = session.upload(world.references[0].read_bytes(), "dusk.png")
     assert again.name == "dusk.png (2)" and session.state.shelf == (card, again)
-    session.handle(1, messages.View(camera=camera_of(session.viewed.scene, 1), captured=True))
+    session.handle(1, messages.ViewRequest(camera=camera_of(session.viewed.scene, 1), captured=True))
     listener.until(lambda: bool(listener.pictures(1, "captured")))
 
 
@@ -151,10 +151,10 @@ def test_an_upload_ends_with_the_viewer(session: Session, world: World) -> None:
 
 def test_an_unexpected_error_is_told_and_nothing_stops(session: Session, listener: Listener) -> None:
     listener.fails = True
-    session.handle(1, messages.View(camera=camera_of(session.viewed.scene, 2)))
+    session.handle(1, messages.ViewRequest(camera=camera_of(session.viewed.scene, 2)))
     listener.until_said("should not have happened")
     listener.fails = False
-    session.handle(1, messages.View(camera=camera_of(session.viewed.scene, 3)))
+    session.handle(1, messages.ViewRequest(camera=camera_of(session.viewed.scene, 3)))
     listener.until(lambda: bool(listener.pictures(1)))
     session.disconnect(1)
     session.disconnect(1)
@@ -176,7 +176,7 @@ def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener)
 
     session._worker.run_when_idle(last())
     assert done.wait(120)
-    assert session.state == State() and listener.sent == [] and not session.restyler._styles
+    assert session.state == SharedState() and listener.sent == [] and not session.restyler._styles
 
 
 def test_newer_states_of_a_training_are_shown_as_they_come(

@@ -17,8 +17,7 @@ from fprf.errors import ConfigError, DataError, UsageError
 from fprf.page import messages
 from fprf.page.drawing import cameras_of
 from fprf.page.messages import SHELF, Camera, Card, Keep, Key, Preset, Set, StartRequest, read_message
-from fprf.page.state import Key as Keyframe
-from fprf.page.state import Look, Photograph, State
+from fprf.page.state import Look, PageKeyframe, Photograph, SharedState
 from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import Reference
@@ -32,7 +31,7 @@ def card(number: int) -> Photograph:
 
 
 A, B, C = (card(i) for i in range(3))
-STATE = State().added(A)
+STATE = SharedState().added(A)
 
 
 def test_pins_replace_each_other_and_forbidden_references_add_up() -> None:
@@ -81,13 +80,13 @@ def test_sliders_and_presets_change_the_style() -> None:
     moved = STATE.changed(Set(name="stylizer.smoothness", value=3)).changed(Set(name="clusters", value=7.0))
     shown = moved.described()["look"]
     assert (shown["stylizer.smoothness"], shown["clusters"]) == (3, 7)
-    whole = State(look=Look(style=StyleConfig(strength=1)))  # a whole number in a field of any numbers
+    whole = SharedState(look=Look(style=StyleConfig(strength=1)))  # a whole number in a field of any numbers
     assert whole.changed(Set(name="strength", value=0.4)).described()["look"]["strength"] == 0.4
     assert moved.changed(Preset(name="gentle")).described()["look"]["strength"] == 0.9
 
 
 def test_a_stylizer_without_a_slider_s_field_has_no_such_slider() -> None:
-    state = State(look=Look(style=StyleConfig(stylizer=AdainConfig())))
+    state = SharedState(look=Look(style=StyleConfig(stylizer=AdainConfig())))
     shown = state.described()["look"]
     assert "strength" in shown and "stylizer.temperature" not in shown
     with pytest.raises(
@@ -99,7 +98,7 @@ def test_a_stylizer_without_a_slider_s_field_has_no_such_slider() -> None:
 def test_a_new_photograph_is_the_style_or_joins() -> None:
     assert STATE.look.mix == ((A, 1.0),) and STATE.shelf == (A,)
     assert STATE.added(B).look.mix == ((B, 1.0),)
-    mixed = State(together=True).added(A).added(B)
+    mixed = SharedState(together=True).added(A).added(B)
     assert mixed.look.mix == ((A, 1.0), (B, 1.0)) and mixed.shelf == (A, B)
     off = STATE.changed(Set(name="strength", value=0))
     assert off.look.plain and off.added(B).look.style.strength == 1.0, "else nothing would be seen of it"
@@ -109,7 +108,7 @@ def test_a_new_photograph_is_the_style_or_joins() -> None:
 
 @pytest.mark.parametrize("together", [False, True])
 def test_the_shelf_is_bounded(together: bool) -> None:
-    state = State(together=together).added(A).changed(Keep(name="mine", action="keep"))
+    state = SharedState(together=together).added(A).changed(Keep(name="mine", action="keep"))
     for number in range(10, 10 + 3 * SHELF):
         state = state.added(card(number))
         assert (
@@ -141,17 +140,17 @@ def test_keys_are_added_moved_and_removed() -> None:
     def camera(number: int) -> Camera:
         return Camera((float(number), 0, 0), ((1, 0, 0), (0, 1, 0), (0, 0, 1)), (9, 9, 8, 6), (16, 12))
 
-    def numbers(state: State) -> list[int]:
+    def numbers(state: SharedState) -> list[int]:
         return [round(each.camera.place[0]) for each in state.keys]
 
     state = STATE
     for number in range(3):
         state = state.changed(Key(action="add", camera=camera(number)))
-    assert numbers(state) == [0, 1, 2] and state.keys[0] == Keyframe(camera(0), state.look)
+    assert numbers(state) == [0, 1, 2] and state.keys[0] == PageKeyframe(camera(0), state.look)
     assert numbers(state.changed(Key(action="earlier", at=2))) == [0, 2, 1]
     assert numbers(state.changed(Key(action="earlier", at=0))) == [0, 1, 2]
     assert numbers(state.changed(Key(action="remove", at=1))) == [0, 2]
-    full = State(keys=(Keyframe(camera(0), Look()),) * 64)
+    full = SharedState(keys=(PageKeyframe(camera(0), Look()),) * 64)
     wrong = [(state, Key(action=each, at=3), "of 3") for each in ("earlier", "remove")]  # type: ignore[arg-type]
     wrong += [(state, Key(action="add"), "camera"), (full, Key(action="add", camera=camera(1)), "64 keys")]
     for before, message, told in wrong:
@@ -182,7 +181,7 @@ MESSAGES: list[dict[str, Any]] = [
 
 def test_what_the_page_sends_passes() -> None:
     kinds = {type(read_message(json.dumps(message))).__name__ for message in MESSAGES}
-    assert kinds == {"View", "Set", "Preset", "Card", "Pick", "Region", "Map", "Keep", "Key", "Film"}
+    assert kinds == {"ViewRequest", "Set", "Preset", "Card", "Pick", "Region", "Map", "Keep", "Key", "Film"}
 
 
 WRONG: list[tuple[str, dict[str, Any]]] = [

@@ -9,7 +9,7 @@ from fprf.evaluation.metrics import psnr
 from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import GaussianLearner
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 
 STEPS = 260
 

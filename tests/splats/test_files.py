@@ -23,7 +23,7 @@ from fprf.splats.files import Capture, read_capture, write_capture, write_gaussi
 from fprf.splats.files.base import format_of, spatial_order
 from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 
 FORMATS = {ending: format_of(Path(f"x{ending}")) for ending in endings()}
 WRITTEN = [ending for ending, form in FORMATS.items() if form.writes and form.reads]

@@ -24,7 +24,7 @@ from fprf.splats.config import LookConfig
 from fprf.splats.drawing import clip_distance, draw, seen_means
 from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
 from fprf.splats.gaussians import GaussianRows, Gaussians
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.splats.views import find_views
 
 # How far positions in a unit ball and ln-scales from -6 to -1 may move.

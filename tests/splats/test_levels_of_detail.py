@@ -80,7 +80,7 @@ def _inverted(gaussians: Gaussians, index: torch.Tensor) -> torch.Tensor:
 def test_a_look_shows_the_levels_of_recoloured_gaussians(
     room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fprf.splats.levels._KEPT", room)
+    monkeypatch.setattr("fprf.splats.levels._MAX_COLOUR_BYTES", room)
     gaussians = _scattered(20_000)
     index = torch.arange(len(gaussians))
     wanted = make_levels_of_detail(gaussians.recoloured(_inverted(gaussians, index)))

@@ -27,7 +27,7 @@ from fprf.splats.drawing import draw
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.sog import _picture, _webp, bundle, unbundle
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 
 
 def headed(data: bytes, change: Callable[[bytes], bytes]) -> bytes:

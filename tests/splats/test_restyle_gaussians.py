@@ -32,7 +32,7 @@ from fprf.splats.config import LookConfig
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import HARMONIC, Gaussians
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.splats.restyle import all_around
 from fprf.splats.scene import SplatScene
 from fprf.splats.views import find_views
@@ -200,8 +200,8 @@ def test_painting_takes_bounded_memory_and_changes_nothing(
         return semantic[:, :3].repeat(1, 7)
 
     whole, opacity = scene.paint(scene.cameras, 0, pixel_grid(scene.cameras, 0), values)
-    monkeypatch.setattr("fprf.splats.scene._ROWS", 64)
-    monkeypatch.setattr("fprf.splats.scene._CHANNELS", 8)
+    monkeypatch.setattr("fprf.splats.scene._PAINTED_GAUSSIANS", 64)
+    monkeypatch.setattr("fprf.splats.scene._PAINTED_CHANNELS", 8)
     asked.clear()
     parts, same = scene.paint(scene.cameras, 0, pixel_grid(scene.cameras, 0), values)
     assert max(asked) == 64 and torch.equal(parts, whole) and torch.equal(opacity, same)

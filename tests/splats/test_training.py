@@ -32,7 +32,7 @@ from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
 from fprf.splats.learner import Bounds, GaussianLearner
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.splats.scene import SplatScene
 from fprf.splats.setup import build
 from fprf.splats.view_corrections import ViewCorrections

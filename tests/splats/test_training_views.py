@@ -12,12 +12,13 @@ from fprf.datamanagers.images import load_images
 from fprf.datamanagers.scene import ParsedScene
 from fprf.rendering.cameras import Cameras, ideal_cameras, project
 from fprf.rendering.paths import pinhole
-from fprf.splats import initial, photographs
+from fprf.splats import initial, photographs, pinholes
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.drawing import draw
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.initial import initial_points
-from fprf.splats.photographs import camera_of, load_photographs, make_levels
+from fprf.splats.photographs import load_photographs, make_levels
+from fprf.splats.pinholes import camera_of
 from fprf.splats.setup import scene_scale
 from fprf.training.prepare import read_scene
 
@@ -73,9 +74,9 @@ def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
     turn = torch.tensor([[1.0, 0, 0, 0]])
     size = torch.full((1, 3), -4.0)
     dot = Gaussians(place[None].float(), turn, size, torch.full((1,), 4.0), torch.ones(1, 1, 3))
-    camera, where = photographs.cover(cameras, 0, 0.01)
+    camera, where = pinholes.cover(cameras, 0, 0.01)
     assert where is not None
-    drawn = photographs.distorted(draw(dot, camera).image, where)
+    drawn = pinholes.distorted(draw(dot, camera).image, where)
     x, y = torch.meshgrid(torch.arange(160) + 0.5, torch.arange(120) + 0.5, indexing="xy")
 
     def middle(image: torch.Tensor) -> torch.Tensor:
@@ -84,7 +85,7 @@ def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
 
     assert (middle(drawn) - pixel[0]).norm() < 0.1
     bytes_ = (drawn.clamp(0, 1) * 255).byte().numpy()
-    back, inside = photographs.undistorted(cameras, 0, bytes_, camera_of(cameras, 0))
+    back, inside = pinholes.undistorted(cameras, 0, bytes_, camera_of(cameras, 0))
     assert inside is not None and 0.8 < inside.mean() < 1.01
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
 
@@ -127,7 +128,7 @@ def test_a_pinhole_covers_all_that_a_lens_shows(lens: int, k: tuple[float, float
     cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64))
     distortion = torch.tensor([[*k, 0.0, 0.001, -0.001]], dtype=torch.float64)
     cameras = replace(cameras, distortion=distortion, lens=torch.tensor([lens]))
-    camera, place = photographs.cover(cameras, 0, 0.01)
+    camera, place = pinholes.cover(cameras, 0, 0.01)
     assert place is not None
     low = place.amin((0, 1))
     high = torch.tensor([camera.width, camera.height]) - place.amax((0, 1))
@@ -141,7 +142,7 @@ def test_targets_made_again_are_the_same(monkeypatch: pytest.MonkeyPatch) -> Non
     images, masks, skies = load_photographs(config, scene, scene.train.tolist())
     whole = make_levels(scene, images, masks, 0.01, skies)
     first = [[level[view] for view in level] for level in whole]
-    monkeypatch.setattr(photographs, "_KEPT", 1)
+    monkeypatch.setattr(photographs, "_MAX_TARGET_BYTES", 1)
     for level, before in zip(make_levels(scene, images, masks, 0.01, skies), first, strict=True):
         for view, old in zip(level, before, strict=True):
             for a, b in zip(level[view], old, strict=True):

@@ -22,11 +22,11 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
 from fprf.page.drawing import write_film_files
 from fprf.page.messages import Camera
-from fprf.page.state import Key, Look
+from fprf.page.state import Look, PageKeyframe
 from fprf.rendering.local_frame import read_offset
 from fprf.rendering.paths import read_camera_path
 from fprf.splats.files import read_capture
-from fprf.splats.photographs import camera_of
+from fprf.splats.pinholes import camera_of
 from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.field_scene import load_run
@@ -167,7 +167,9 @@ def test_paths_and_places_are_given_in_the_capture_s_coordinates(
     origin = scene.trained.scene.origin
     pinhole = camera_of(cameras, 2)
     axes = tuple(tuple(row) for row in pinhole.world_to_camera[:3, :3].tolist())
-    key = Key(Camera(tuple(cameras.pose[2, :, 3].tolist()), axes, (30, 30, 16, 12), (32, 24)), Look())
+    key = PageKeyframe(
+        Camera(tuple(cameras.pose[2, :, 3].tolist()), axes, (30, 30, 16, 12), (32, 24)), Look()
+    )
     write_film_files(tmp_path, (key, key), 0.5, scene.trained.scene, side=32)
     written = json.loads((tmp_path / "path.json").read_text())["camera_path"][0]["camera_to_world"]
     assert np.abs(np.array(written).reshape(4, 4)[:3, 3] - at).max() < 1e-6

@@ -1,76 +1,178 @@
 // The page of `fprf view`: the same stage with the scene of a server, which hears small messages and answers with colours.
+// This file has the connection and the scene that it shows; panel.js has the controls beside it, field.js the pictures
+// that a server draws, photographs.js what is dropped, start.js the page before there is a scene.
+
+const RECONNECT_MS = 1500; // until a lost connection is tried again; by eye
+const NOTE_MS = 6000; // that a note stays; by eye
+const MAX_NOTES = 4; // at the same time; by eye
+
+/**
+ * The head of a scene, as the server tells it (session.py).
+ * @typedef {{key: string, name: string, step: number, gaussians: boolean}} SceneInfo
+ *
+ * A camera in messages (messages.py): place and axes in the world, fx fy cx cy, width and height.
+ * @typedef {{place: number[], axes: number[][], lens: number[], size: number[]}} CameraMessage
+ *
+ * What all pages share (state.py).
+ * @typedef {{card: number, name: string, weight: number, colour: ?string}} ShelfRow
+ * @typedef {{region: number, share: number, taken: {name: string, share: number}[], rules: {action: string, card: ?number}[]}} PickedRegion
+ * @typedef {{shelf: ShelfRow[], look: Object<string, number>, map: string, picked: ?PickedRegion, kept: string[],
+ *   keys: CameraMessage[], film: {done: number, total: number, ready: boolean}}} SharedState
+ */
+
+/**
+ * Send a body to the server.
+ * @param {string} path
+ * @param {BodyInit=} body
+ * @returns {Promise<any>} the JSON that it answers; an error with its words where it refuses
+ */
 const post = async (path, body) => {
   const answer = await fetch(path, { method: "POST", body });
   if (!answer.ok) throw new Error((await answer.text()).trim() || answer.statusText);
   return answer.json();
 };
-// What is wrong stays until it is clicked away.
+
+/**
+ * Show a note. What is wrong stays until it is clicked away.
+ * @param {string} text
+ * @param {boolean=} bad
+ * @returns {HTMLButtonElement}
+ */
 const say = (text, bad = false) => {
-  const line = make("button", { type: "button", textContent: text, className: bad ? "bad" : "", title: "close", onclick: () => line.remove() });
+  const close = () => line.remove();
+  const line = make("button", { type: "button", textContent: text, className: bad ? "bad" : "", title: "close", onclick: close });
   at("said").append(line);
-  while (at("said").children.length > 4) at("said").firstChild.remove();
-  if (!bad) setTimeout(() => line.remove(), 6000);
+  while (at("said").children.length > MAX_NOTES) at("said").firstChild.remove();
+  if (!bad) setTimeout(close, NOTE_MS);
   return line;
 };
-// JSON and sections of one body (pack.py).
+
+/**
+ * JSON and sections of one body (pack.py): bytes of the head as a number of four bytes, the head, the sections.
+ * @param {Response} answer
+ * @returns {Promise<{head: any, parts: Object<string, Uint8Array>}>}
+ */
 const unpacked = async (answer) => {
   if (!answer.ok) throw new Error((await answer.text()).trim());
-  const data = new Uint8Array(await answer.arrayBuffer()), length = new DataView(data.buffer).getUint32(0, true);
-  const head = JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + length))), parts = {};
+  const data = new Uint8Array(await answer.arrayBuffer());
+  const length = new DataView(data.buffer).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + length)));
+  const parts = {};
   let from = 4 + length;
-  for (const [name, size] of Object.entries(head.sizes)) { parts[name] = data.subarray(from, from + size); from += size; }
+  for (const [name, size] of Object.entries(head.sizes)) {
+    parts[name] = data.subarray(from, from + size);
+    from += size;
+  }
   return { head, parts };
 };
 
+/** Let the browser save a file. */
+const download = (href, name = "") => {
+  const link = make("a", { href, download: name });
+  document.body.append(link);
+  link.click();
+  link.remove();
+};
+
+/** The connection to the server, and the scene that it shows. */
 class Live {
   constructor() {
-    Object.assign(this, { place: null, stage: null, scene: null, state: null, asked: false, changed: false, last: {}, cards: new Map(), pending: new Map() });
+    /** @type {?Place} where one stands in the scene */
+    this.place = null;
+    /** @type {?Stage} the controls of its looks */
+    this.stage = null;
+    /** @type {?SceneInfo} */
+    this.scene = null;
+    /** @type {?SharedState} as the server told it last */
+    this.state = null;
+    // What was heard is done one after the other: some of it takes further requests.
+    this.queue = Promise.resolve();
+    // True from what was changed on this page until its colours have come.
+    this.changed = false;
     this.start = new Start();
-    this.controls();
+    this.field = new Field(this);
+    this.panel = new Panel(this);
+    this.photographs = new Photographs(this);
+    at("finish").onclick = () => this.start.stop();
+    at("scenes").onclick = () => post("/start", JSON.stringify({ type: "leave" })).catch((error) => say(error.message, true));
     this.connect();
   }
 
   connect() {
-    const socket = this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live`);
-    socket.binaryType = "arraybuffer";
-    socket.onmessage = ({ data }) => { this.queue = (this.queue ?? Promise.resolve()).then(() => this.hear(data)).catch((error) => say(error.message, true)); };
-    socket.onclose = () => setTimeout(() => this.connect(), 1500);
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    this.socket = new WebSocket(`${scheme}://${location.host}/live`);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onmessage = ({ data }) => {
+      this.queue = this.queue.then(() => this.hear(data)).catch((error) => say(error.message, true));
+    };
+    this.socket.onclose = () => setTimeout(() => this.connect(), RECONNECT_MS);
   }
 
+  /** Send a message (messages.py). */
   tell(type, more = {}) {
     if (["set", "preset", "card", "map", "region"].includes(type)) this.changed = true;
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type, ...more }));
   }
 
+  /**
+   * Do what a message says: bytes are a picture, all others JSON.
+   * @param {string|ArrayBuffer} data
+   */
   async hear(data) {
-    if (typeof data !== "string") { await this.paint(new Uint8Array(data)); return; }
+    if (typeof data !== "string") {
+      await this.field.paint(new Uint8Array(data));
+      return;
+    }
     const message = JSON.parse(data);
-    if (message.type === "said") say(message.text, message.bad);
-    else if (message.type === "start") this.begun(message);
-    else if (message.type === "loading") this.mode("loading");
-    else if (message.type === "scene") await this.open(message);
-    else if (message.type === "state") this.fill(message);
-    else if (message.type === "training") this.trained(message);
-    else if (message.type === "colours") await this.recolour(message);
+    switch (message.type) {
+      case "said": say(message.text, message.bad); break;
+      case "start": this.began(message); break;
+      case "loading": this.mode("loading"); break;
+      case "scene": await this.open(message); break;
+      case "training": this.trained(message); break;
+      case "colours": await this.recolour(message); break;
+      case "state":
+        this.state = message;
+        this.panel.fill(message);
+        break;
+    }
   }
 
-  // How far the start is; with a scene of its own, which may still be trained.
-  begun(message) {
-    if (!this.scene) { this.mode("start"); this.start.fill(message); return; }
-    if (message.stage === "idle") { location.reload(); return; }
+  /** How far the start is; with a scene of its own, which may still be trained. */
+  began(message) {
+    if (!this.scene) {
+      this.mode("start");
+      this.start.fill(message);
+      return;
+    }
+    if (message.stage === "idle") {
+      location.reload();
+      return;
+    }
     at("scenes").hidden = false;
     at("finish").hidden = message.stage !== "training" || Boolean(message.error);
     if (message.error) say(message.error, true);
   }
 
+  /** Show one part of the page: start, scene or loading. */
   mode(name) {
     for (const each of ["start", "scene", "loading"]) at(each).hidden = each !== name;
   }
 
+  /**
+   * Show a scene, or a newer state of its training.
+   * @param {SceneInfo} scene
+   */
   async open(scene) {
     const before = this.scene;
-    if (before && before.key !== scene.key) { location.reload(); return; }
-    if (before && before.step === scene.step) { this.place.touch(); return; } // it was only away for a moment
+    if (before && before.key !== scene.key) {
+      location.reload();
+      return;
+    }
+    if (before && before.step === scene.step) { // it was only away for a moment
+      this.place.touch();
+      return;
+    }
     const { head, parts } = await unpacked(await fetch("/scene"));
     this.mode("scene");
     this.scene = scene;
@@ -79,223 +181,73 @@ class Live {
     at("place").classList.toggle("field", !scene.gaussians);
     at("save-ply").hidden = !scene.gaussians;
     head.alone = true;
-    const splats = scene.gaussians ? before ? this.place.splats : new Splats(at("canvas")) : null;
-    if (splats) {
+    let splats = null;
+    if (scene.gaussians) {
+      splats = before ? this.place.splats : new Splats(at("canvas"));
       await splats.load(head, parts);
       await splats.add("Captured", head.styles[0], parts["style-0"]);
     }
-    if (before) { // a newer state of its training
+    if (before) {
       this.place.scene = head;
       this.place.touch();
-      return;
-    }
-    this.place = new Place(at("canvas"), head, splats, splats ? null : () => this.paintField());
+    } else this.enter(head, splats);
+  }
+
+  /** Make the stage of a scene that is shown for the first time; `splats` null = the server draws. */
+  enter(head, splats) {
+    this.place = new Place(at("canvas"), head, splats, splats ? null : () => this.field.step());
     this.place.listeners.pick = (x, y) => {
+      if (!this.state?.shelf.length) return; // nothing could be said about what is picked
       const box = at("canvas").getBoundingClientRect();
-      if (this.state?.shelf.length) this.tell("pick", { camera: this.camera(), x: (x - box.left) / box.width, y: (y - box.top) / box.height });
+      this.tell("pick", { camera: this.camera(), x: (x - box.left) / box.width, y: (y - box.top) / box.height });
     };
     this.place.listeners.drawn = () => at("place").classList.add("drawn");
     this.stage = new Stage(this.place, [{ name: "Captured" }]);
-    this.stage.listeners.chosen = (name) => { if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" }); };
+    this.stage.listeners.chosen = (name) => {
+      if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" });
+    };
     window.fprf = { place: this.place, stage: this.stage, live: this };
   }
 
+  /** Progress of the scene's training. */
   trained({ step, share, psnr, seconds_left: left }) {
     const clock = `${Math.floor(left / 60)}:${String(left % 60).padStart(2, "0")} left`;
+    const [bar, text] = at("training").children;
     at("training").hidden = false;
-    at("training").children[0].value = share;
-    at("training").children[1].textContent = share < 1 ? `training, step ${step} · ${psnr.toFixed(1)} dB · ${clock}` : `trained, ${step} steps`;
+    bar.value = share;
+    text.textContent = share < 1 ? `training, step ${step} · ${psnr.toFixed(1)} dB · ${clock}` : `trained, ${step} steps`;
   }
 
+  /** Fetch colours that the server has made, under a name of the stage. */
   async recolour({ name, version }) {
-    const { head, parts } = await unpacked(await fetch(`/colours?name=${encodeURIComponent(name)}&version=${version}`));
+    const address = `/colours?name=${encodeURIComponent(name)}&version=${version}`;
+    const { head, parts } = await unpacked(await fetch(address));
     await this.place.splats.add(name, head, parts.rows);
     this.place.touch(false);
-    const { styles, from, to, wiping, amount } = this.stage, fresh = !styles.some((style) => style.name === name);
+    const { styles, from, to, wiping, amount } = this.stage;
+    const fresh = !styles.some((style) => style.name === name);
     this.stage.add({ name });
     if (name !== "Now") return;
     // What was changed here is seen here; what others change is not thrust upon this page.
-    if (fresh || (this.changed && to !== name && (from !== name || !(wiping || amount < 1)))) this.stage.choose(name);
+    const compared = from === name && (wiping || amount < 1);
+    if (fresh || (this.changed && to !== name && !compared)) this.stage.choose(name);
     this.changed = false;
   }
 
-  // Where the server draws: the newest pictures, and the line between them.
-  async paint(data) {
-    const kind = data[0] ? "captured" : "look", bitmap = await createImageBitmap(new Blob([data.subarray(1)], { type: "image/jpeg" }));
-    this.last[kind]?.close();
-    this.last[kind] = bitmap;
-    this.drawField();
-  }
-
-  drawField() {
-    const { canvas, wipe } = this.place, context = canvas.getContext("2d"), { look, captured } = this.last;
-    if (!look) return;
-    context.drawImage(look, 0, 0, canvas.width, canvas.height);
-    if (wipe >= 0 && captured) context.drawImage(captured, 0, 0, wipe * captured.width, captured.height, 0, 0, wipe * canvas.width, canvas.height);
-    at("place").classList.add("drawn");
-  }
-
-  paintField() {
-    const place = this.place, now = performance.now(), captured = place?.wipe >= 0;
-    if (!place?.changed && this.captured === captured) return;
-    if ((place.moved || this.captured !== captured) && now - (this.sent ?? 0) > 40) {
-      Object.assign(this, { sent: now, captured });
-      place.moved = false;
-      this.tell("view", { camera: this.camera(), captured });
-    }
-    place.changed = place.moved;
-    this.drawField();
-  }
-
+  /** @returns {CameraMessage} where one stands now */
   camera() {
     const { camera, canvas, lens } = this.place;
     return { place: camera.place, axes: camera.axes, lens, size: [canvas.width, canvas.height] };
   }
 
-  // The state of the server
-  fill(state) {
-    this.state = state;
-    const now = new Set(state.shelf.map((row) => row.card));
-    for (const [card, node] of this.cards) if (!now.has(card)) { node.remove(); this.cards.delete(card); }
-    for (const row of state.shelf) {
-      if (!this.cards.has(row.card)) { this.cards.set(row.card, this.card(row)); at("shelf").insertBefore(this.cards.get(row.card), at("add-photograph")); }
-      const node = this.cards.get(row.card);
-      node.classList.toggle("on", row.weight > 0);
-      node.style.setProperty("--chip", row.colour ?? "transparent");
-      if (node.weight !== document.activeElement) node.weight.value = row.weight;
-      node.weight.hidden = state.shelf.length < 2;
-    }
-    for (const slider of document.querySelectorAll("[data-look]")) {
-      slider.parentElement.hidden = !(slider.dataset.look in state.look);  // another stylizer has other fields
-      if (slider !== document.activeElement) slider.value = state.look[slider.dataset.look];
-    }
-    at("map").value = state.map;
-    at("hint").hidden = !state.shelf.length || Boolean(state.picked);
-    this.fillRegion(state.picked, state.shelf);
-    if (this.scene && !this.scene.gaussians && this.stage) state.kept.forEach((name) => this.stage.add({ name }));
-    at("keys").replaceChildren(...state.keys.map((key, k) => make("span", { className: "key" },
-      make("button", { type: "button", textContent: k + 1, title: "go there", onclick: () => this.place.go(this.keyed(key)) }),
-      make("button", { type: "button", textContent: "‹", title: "earlier", onclick: () => this.tell("key", { action: "earlier", at: k }) }),
-      make("button", { type: "button", textContent: "×", title: "remove", onclick: () => this.tell("key", { action: "remove", at: k }) }))));
-    const busy = state.film.total > 0 && !state.film.ready;
-    at("make-film").textContent = busy ? `${state.film.done} / ${state.film.total}` : "Make film";
-    at("make-film").disabled = busy || !state.keys.length;
-    at("play").disabled = state.keys.length < 2;
-    if (this.before && state.film.ready && !this.before.film.ready) this.offer("/film", "download the film");
-    this.before = state;
-  }
-
-  offer(href, text) {
-    const line = say("", true);
-    line.classList.remove("bad");
-    line.append(make("a", { href, textContent: text, download: "" }));
-  }
-
-  download(href, name = "") {
-    const link = make("a", { href, download: name });
-    document.body.append(link);
-    link.click();
-    link.remove();
-  }
-
-  // What is seen, as large as it is here; WebGL keeps no picture, so it is drawn once more.
-  picture() {
-    const { canvas, splats, camera, lens, look, scene } = this.place;
-    splats?.draw(camera.view, lens, look, { near: scene.near, background: scene.background, exact: true });
-    canvas.toBlob((blob) => this.download(URL.createObjectURL(blob), `${this.scene.name}.png`));
-  }
-
-  card(row) {
-    const picture = make("img", { src: `/card?card=${row.card}`, alt: row.name, draggable: false });
-    const alone = make("button", { type: "button", className: "photo", title: `${row.name}: this one alone; with Shift in or out of the mix`, onclick: (event) => (event.shiftKey
-      ? this.tell("card", { card: row.card, action: "weight", weight: node.classList.contains("on") ? 0 : 1 }) : this.tell("card", { card: row.card, action: "alone" })) }, picture);
-    const weight = make("input", { type: "range", min: 0, max: 2, step: 0.05, title: "weight in the mix" });
-    weight.setAttribute("aria-label", `weight of ${row.name}`);
-    weight.oninput = () => this.steady(`card ${row.card}`, () => this.tell("card", { card: row.card, action: "weight", weight: +weight.value }));
-    const node = make("div", { className: "card" }, alone, make("span", { textContent: row.name }), weight,
-      make("button", { type: "button", className: "close", textContent: "×", title: "remove", onclick: () => this.tell("card", { card: row.card, action: "remove" }) }));
-    return Object.assign(node, { weight });
-  }
-
-  // The last message of a kind in 40 ms.
-  steady(kind, send) {
-    if (!this.pending.size) setTimeout(() => { this.pending.forEach((each) => each()); this.pending.clear(); }, 40);
-    this.pending.set(kind, send);
-  }
-
-  fillRegion(picked, rows) {
-    at("region").hidden = !picked;
-    if (!picked) return;
-    const is = (action, card) => picked.rules.some((rule) => rule.action === action && rule.card === card);
-    const button = (text, action, card, set) => make("button", { type: "button", className: "pill", textContent: text, ariaPressed: String(set),
-      onclick: () => this.tell("region", { action: set ? "free" : action, card }) });
-    const share = new Map(picked.taken.map((row) => [row.name, row.share]));
-    at("region").replaceChildren(
-      make("p", {}, make("b", { textContent: "This thing" }), ` ${(100 * picked.share).toFixed(1)} % of the scene`,
-        make("button", { type: "button", className: "close", textContent: "×", title: "close", onclick: () => this.tell("region", { action: "close" }) })),
-      ...rows.map((row) => make("div", { className: "row" }, make("span", { textContent: `${row.name} ${share.has(row.name) ? `${Math.round(100 * share.get(row.name))} %` : ""}` }),
-        button("only", "pin", row.card, is("pin", row.card)), button("never", "forbid", row.card, is("forbid", row.card)))),
-      make("div", { className: "row" }, button("keep as it is", "keep", null, is("keep", null)), button("free", "free", null, false)));
-  }
-
+  /**
+   * @param {CameraMessage} key
+   * @returns {Camera} to go to
+   */
   keyed(key) {
+    const { axes, place, lens, size } = key;
     const view = Object.create(Camera.prototype);
-    return Object.assign(view, { axes: key.axes, place: key.place, lens: key.lens, size: key.size, distance: this.place.camera.distance });
-  }
-
-  async send(files) {
-    for (const file of [...files].slice(0, 12)) {
-      const line = say(`${file.name} …`, true);
-      line.className = "";
-      try {
-        this.changed = true;
-        await post(`/photograph?name=${encodeURIComponent(file.name)}`, file);
-      } catch (error) {
-        say(`${file.name}: ${error.message}`, true);
-      }
-      line.remove();
-    }
-  }
-
-  controls() {
-    const over = (event, on) => {
-      if (!event.dataTransfer?.types.includes("Files")) return false;
-      event.preventDefault();
-      at("veil").hidden = !(on && this.scene);
-      at("drop").classList.toggle("over", on);
-      return true;
-    };
-    addEventListener("dragover", (event) => over(event, true));
-    addEventListener("dragleave", (event) => { if (!event.relatedTarget) over(event, false); });
-    addEventListener("drop", (event) => {
-      if (!over(event, false)) return;
-      if (this.scene) this.send(event.dataTransfer.files);
-      else this.start.drop(event.dataTransfer);
-    });
-    addEventListener("paste", (event) => {
-      const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
-      if (this.scene && files.length) this.send(files);
-    });
-    at("add-photograph").onclick = () => at("photographs").click();
-    at("photographs").onchange = () => this.send(at("photographs").files).then(() => { at("photographs").value = ""; });
-    for (const slider of document.querySelectorAll("[data-look]")) {
-      slider.oninput = () => this.steady(slider.dataset.look, () => this.tell("set", { name: slider.dataset.look, value: +slider.value }));
-    }
-    at("map").onchange = () => this.tell("map", { map: at("map").value });
-    at("gentle").onclick = () => this.tell("preset", { name: "gentle" });
-    at("keep").onsubmit = (event) => { event.preventDefault(); this.tell("keep", { name: at("keep-name").value, action: "keep" }); };
-    at("add-key").onclick = () => this.tell("key", { action: "add", camera: this.camera() });
-    at("play").onclick = async () => {
-      for (const key of this.state.keys) {
-        this.place.go(this.keyed(key), +at("seconds").value);
-        while (this.place.flight) await new Promise((done) => setTimeout(done, 30));
-      }
-    };
-    at("make-film").onclick = () => this.tell("film", { seconds: +at("seconds").value });
-    at("save-ply").onclick = () => this.download("/gaussians");
-    at("save-picture").onclick = () => this.picture();
-    at("finish").onclick = () => this.start.stop();
-    at("scenes").onclick = () => post("/start", JSON.stringify({ type: "leave" })).catch((error) => say(error.message, true));
+    return Object.assign(view, { axes, place, lens, size, distance: this.place.camera.distance });
   }
 }
 

@@ -1,0 +1,57 @@
+// Scenes that the server draws: the newest pictures on the canvas, and requests for others where the camera moves.
+
+const VIEW_MS = 40; // between two requests; by eye
+
+/** Pictures of a scene without Gaussians. */
+class Field {
+  /** @param {Live} live */
+  constructor(live) {
+    this.live = live;
+    /** @type {{look: ?ImageBitmap, captured: ?ImageBitmap}} the newest picture of each kind */
+    this.last = { look: null, captured: null };
+    // The last request: when it was sent, and whether it asked for the captured colours too.
+    this.sent = 0;
+    this.captured = undefined;
+  }
+
+  /**
+   * Show a picture that has come.
+   * @param {Uint8Array} data one byte for its kind, and a JPEG
+   */
+  async paint(data) {
+    const kind = data[0] ? "captured" : "look";
+    const bitmap = await createImageBitmap(new Blob([data.subarray(1)], { type: "image/jpeg" }));
+    this.last[kind]?.close();
+    this.last[kind] = bitmap;
+    this.draw();
+  }
+
+  /** Draw the look, and left of the line what was captured. */
+  draw() {
+    const { canvas, wipe } = this.live.place;
+    const { look, captured } = this.last;
+    const context = canvas.getContext("2d");
+    if (!look) return;
+    context.drawImage(look, 0, 0, canvas.width, canvas.height);
+    if (wipe >= 0 && captured) {
+      context.drawImage(captured, 0, 0, wipe * captured.width, captured.height, 0, 0, wipe * canvas.width, canvas.height);
+    }
+    at("place").classList.add("drawn");
+  }
+
+  /** Once a frame: ask for what the camera sees where it has moved, at most every `VIEW_MS`. */
+  step() {
+    const place = this.live.place;
+    const captured = place?.wipe >= 0;
+    if (!place?.changed && this.captured === captured) return;
+    const now = performance.now();
+    if ((place.moved || this.captured !== captured) && now - this.sent > VIEW_MS) {
+      this.sent = now;
+      this.captured = captured;
+      place.moved = false;
+      this.live.tell("view", { camera: this.live.camera(), captured });
+    }
+    place.changed = place.moved;
+    this.draw();
+  }
+}

@@ -1,0 +1,61 @@
+// Photographs that are dropped, pasted or chosen, and sent to the server.
+
+const MAX_SENT = 12; // photographs at once: as many as the shelf holds (messages.py)
+
+/** What comes from the user's machine. */
+class Photographs {
+  /** @param {Live} live */
+  constructor(live) {
+    this.live = live;
+    addEventListener("dragover", (event) => this.over(event, true));
+    addEventListener("dragleave", (event) => {
+      if (!event.relatedTarget) this.over(event, false);
+    });
+    addEventListener("drop", (event) => {
+      if (!this.over(event, false)) return;
+      if (live.scene) this.send(event.dataTransfer.files);
+      else live.start.drop(event.dataTransfer);
+    });
+    addEventListener("paste", (event) => {
+      const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
+      if (live.scene && files.length) this.send(files);
+    });
+    at("add-photograph").onclick = () => at("photographs").click();
+    at("photographs").onchange = async () => {
+      await this.send(at("photographs").files);
+      at("photographs").value = "";
+    };
+  }
+
+  /**
+   * Show where files may be dropped.
+   * @param {DragEvent} event
+   * @param {boolean} on
+   * @returns {boolean} whether it carries files
+   */
+  over(event, on) {
+    if (!event.dataTransfer?.types.includes("Files")) return false;
+    event.preventDefault();
+    at("veil").hidden = !(on && this.live.scene);
+    at("drop").classList.toggle("over", on);
+    return true;
+  }
+
+  /**
+   * Send photographs, one after the other; a refused one is named.
+   * @param {Iterable<File>} files
+   */
+  async send(files) {
+    for (const file of [...files].slice(0, MAX_SENT)) {
+      const line = say(`${file.name} …`, true);
+      line.className = "";
+      try {
+        this.live.changed = true;
+        await post(`/photograph?name=${encodeURIComponent(file.name)}`, file);
+      } catch (error) {
+        say(`${file.name}: ${error.message}`, true);
+      }
+      line.remove();
+    }
+  }
+}
