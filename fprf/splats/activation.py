@@ -26,7 +26,8 @@ eye).
 _MIN_MEDIAN_BYTE = 4.0
 """Of colours in [0, 255], at least: as harmonics half of all would be 1.6 times white."""
 _MAX_BYTE = 255.0
-_MIN_OPACITY = 1 / 255
+"""White, of colours as bytes."""
+_MIN_LARGEST_OPACITY = 1 / 255
 """Of the most opaque Gaussian: as opacities of nothing but transparent ones they would make no sense."""
 _MIN_SIZE = 1e-30
 """Sizes are at least this, so that their logarithm is finite."""
@@ -75,7 +76,7 @@ def find_activation(gaussians: Gaussians, *, asked: bool = False) -> Activation:
     logits = gaussians.logits[gaussians.logits.isfinite()]
     constants = gaussians.harmonics[:, 0]
     constants = constants[constants.isfinite()]
-    opacities = _within(logits, 1.0) and float(logits.max()) > _MIN_OPACITY
+    opacities = _within(logits, 1.0) and float(logits.max()) > _MIN_LARGEST_OPACITY
     return Activation(opacities, _are_sizes(gaussians), _white_of(constants, asked))
 
 

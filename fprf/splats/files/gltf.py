@@ -34,18 +34,27 @@ from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _EXTENSION_NAME = "KHR_gaussian_splatting"
+"""As it stands in files, before each of its attributes."""
 _POSITION = "POSITION"
+"""Relative to the node."""
 _ROTATION = f"{_EXTENSION_NAME}:ROTATION"
+"""x y z w."""
 _SCALE_ATTRIBUTE = f"{_EXTENSION_NAME}:SCALE"
+"""Sizes, or their logarithms."""
 _OPACITY = f"{_EXTENSION_NAME}:OPACITY"
+"""A share, 0 to 1."""
 _SHAPE_WIDTHS = {_POSITION: 3, _ROTATION: 4, _SCALE_ATTRIBUTE: 3, _OPACITY: 1}
 """Attributes of every primitive of Gaussians, and the numbers of each."""
 _COMPONENT_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """Types by their numbers in glTF, which are OpenGL's."""
 _FLOAT = 5126
+"""Number of float32."""
 _BYTE = 5121
+"""Number of bytes."""
 _WIDTH_OF_TYPE = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+"""Numbers of a row, of the types that are read."""
 _TYPE_OF_WIDTH = {width: name for name, width in _WIDTH_OF_TYPE.items()}
+"""The same for writing."""
 _LN_SIZE_LIMITS = (-80.0, 80.0)
 """ln-scales that are written: their sizes are finite in float32, and not 0."""
 _MAX_NODE_SHEAR = 1e-3

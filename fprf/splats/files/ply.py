@@ -31,9 +31,11 @@ from .ply_chunks import chunk_tables, flat_harmonics, is_chunked, kept_by_chunks
 from .ply_tables import BYTE_ORDER_MARK, Element, Header, ply_file, ply_head, read_header, read_tables
 
 _MEANINGFUL_COMMENT = re.compile(r"(splatrendermode|antialiased|vertical axis)\b[\s:=]*(.*)", re.IGNORECASE)
+"""Comments that say something of a capture, with what they say."""
 _NERFSTUDIO = re.compile(r"\bner(f)?studio\b", re.IGNORECASE)
 """Its exporter calls itself Nerstudio, and writes `Vertical Axis: z` whatever the scene is."""
 _BRUSH = re.compile(r"\bbrush\b", re.IGNORECASE)
+"""It writes `Exported from Brush`."""
 _BRUSH_UP: dict[str, Direction] = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 """What points up where Brush names a vertical axis by its letter."""
 _USUAL_UP_OF_LETTER: dict[str, Direction] = _BRUSH_UP | {"z": (0.0, 0.0, 1.0)}

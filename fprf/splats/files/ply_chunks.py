@@ -29,10 +29,13 @@ _LN_SCALE_RANGE = (-20.0, 20.0)
 _MAX_OUTLIERS = 32
 """Outliers that are left out, at most; more are surroundings (by eye)."""
 _WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+"""Properties of `vertex`, a word each."""
 _POSITION_BITS = (11, 10, 11)
 """Of positions and of scales."""
 _ROTATION_BITS = (10, 10, 10)
+"""Of the three smaller components of a rotation; two bits say which one is left out."""
 _COLOUR_BITS = (8, 8, 8, 8)
+"""Of red, green, blue and opacity."""
 _HARMONIC_RANGE = 8.0
 """Width of that of harmonics, [-4, 4]."""
 
@@ -53,6 +56,7 @@ _SCALE_BOUNDS = _Bounds(
     ("min_scale_x", "min_scale_y", "min_scale_z"), ("max_scale_x", "max_scale_y", "max_scale_z")
 )
 _COLOUR_BOUNDS = _Bounds(("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b"))
+"""Missing in early files."""
 
 
 def is_chunked(header: Header) -> bool:

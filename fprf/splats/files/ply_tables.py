@@ -49,6 +49,7 @@ _WORD_OF_DTYPE = {
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 """Put before a file that some editor took for text (Windows)."""
 _ASCII = ["ascii", "1.0"]
+"""Words of a format line, of text."""
 _BINARY = (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"])
 """Words of a header's format line."""
 _MIN_ASCII_BYTES = 2

@@ -17,6 +17,7 @@ from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 
 _SPLAT_RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
+"""A Gaussian, in 32 bytes."""
 _MIN_DEVIATION = 1e-12
 """Standard deviations are at least this, so that their logarithm is finite."""
 
@@ -57,7 +58,8 @@ class Splat(CaptureFormat):
         """In the order of the Gaussians. The file cannot say that they are antialiased."""
         means, turns, scales, logits, harmonics = base.arrays(gaussians)
         table = np.empty(len(gaussians), _SPLAT_RECORD)
-        table["mean"], table["deviation"] = means, np.exp(scales)
+        table["mean"] = means
+        table["deviation"] = np.exp(scales)
         table["rgba"][:, :3] = base.steps(base.colours_of(harmonics), 255)
         table["rgba"][:, 3] = base.steps(base.sigmoid(logits), 255)
         # 128 is 0: a component of 1 does not fit by half a step.

@@ -39,7 +39,9 @@ _WIDE_HEADER = struct.Struct("<IIIBBBBI12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
 """Bytes of a stream, packed and unpacked."""
 _ANTIALIASED_FLAG = 1
+"""Bit of the flags: opacities are compensated (Mip-Splatting)."""
 _EXTENSIONS_FLAG = 2
+"""Bit of the flags: extensions follow."""
 _MAX_FRACTION = 23
 """Fractional bits of positions at most: of 24 bits one is the sign."""
 _MAX_POSITION_STEPS = 2**23 - 1
@@ -63,6 +65,7 @@ _MAX_GZIP_RATIO = 1032
 _MAX_ZSTD_RATIO = 64
 """The same of positions of version 4, which hardly shrink in captures, and some bytes for small files."""
 _ZSTD_SLACK_BYTES = 1 << 16
+"""What a small stream may unpack to beyond that."""
 _MAX_TRAILER_BYTES = 1 << 20
 """Bytes behind the streams (extensions) that are kept."""
 _PIECE_BYTES = 1 << 12
@@ -94,8 +97,9 @@ class _Header(NamedTuple):
 
 
 _TINT_STREAM = 2
+"""Number of the stream of mean colours."""
 _REST_STREAM = 5
-"""Numbers of the streams that colours are in."""
+"""Number of that of the other harmonics."""
 
 
 class _Container(NamedTuple):

@@ -27,6 +27,7 @@ _COORDINATE_SYSTEM = 0xADBE0003
 _RECORD_HEAD = struct.Struct("<II")
 """Type of an extension and length of its payload, which follows."""
 _AXES_NUMBER = struct.Struct("<I")
+"""The payload of the extension that names the axes."""
 _MAX_AXES_NUMBER = 16
 """Numbers of axes: three bits for the ends of the axes, one for y and z swapped."""
 _LIBRARY_FRACTION = 12
