@@ -160,9 +160,8 @@ class BlockedSemantic(SemanticField):
 
     def penalties(self) -> dict[str, Tensor]:
         """Penalties of the members in memory, added up."""
-        return add_penalties(
-            member.semantic.penalties() for member in self.members.held if member.semantic is not None
-        )
+        parts = [member.semantic for member in self.members.held]
+        return add_penalties(part.penalties() for part in parts if part is not None)
 
 
 def _blended(densities: list[Tensor], group: Group) -> Annotated[Tensor, "n"]:
@@ -267,9 +266,8 @@ def inherit(member: Member, around: Member) -> None:
             for parameter in module.parameters():
                 known.add(id(parameter))
         planes = any(isinstance(module, Planes) for module in modules)
-        if not planes or not all(
-            id(parameter) in known or parameter.ndim == 1 for parameter in own.parameters()
-        ):
+        others = [parameter for parameter in own.parameters() if id(parameter) not in known]
+        if not planes or any(parameter.ndim != 1 for parameter in others):
             continue
         # Networks are copied, planes are resampled where the block lies.
         own.load_state_dict(other.state_dict())

@@ -176,16 +176,12 @@ class AdaptiveLayout(BlockLayout):
         else:
             margin = 0.0
         # What is found on the region's border lies inside its blocks.
-        return _cells(
-            [
-                (
-                    torch.where(first <= low, first - margin, first),
-                    torch.where(last >= high, last + margin, last),
-                )
-                for first, last in leaves
-            ],
-            margin,
-        )
+        boxes = []
+        for first, last in leaves:
+            outer_low = torch.where(first <= low, first - margin, first)
+            outer_high = torch.where(last >= high, last + margin, last)
+            boxes.append((outer_low, outer_high))
+        return _cells(boxes, margin)
 
 
 class BisectLayout(BlockLayout):

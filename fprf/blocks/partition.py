@@ -26,7 +26,7 @@ from ..io.strict_json import open_json
 from ..plugins.codec import from_json
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.space import Space, slab
-from ..types import Cell, Site
+from ..types import Cell, Site, Window
 from .config import LayoutConfig
 from .layouts import bounds
 from .routing import chart_of
@@ -282,20 +282,16 @@ def write_cells(file: Path, cells: Sequence[Cell]) -> bool:
     """Write a partition; True where the file holds another one. Raises CheckpointError where that cannot be
     read.
     """
-    document = {
-        "format": _PARTITION_FORMAT,
-        "frame": cells[0].frame.tolist(),
-        "cells": [
-            {
-                # JSON knows no infinity.
-                "low": [x if math.isfinite(x) else None for x in cell.low.tolist()],
-                "high": [x if math.isfinite(x) else None for x in cell.high.tolist()],
-                "border": cell.border.tolist(),
-                "windows": [[view, *window] for view, window in cell.windows.items()],
-            }
-            for cell in cells
-        ],
-    }
+    rows = []
+    for cell in cells:
+        row = {
+            "low": _finite(cell.low),
+            "high": _finite(cell.high),
+            "border": cell.border.tolist(),
+            "windows": [[view, *window] for view, window in cell.windows.items()],
+        }
+        rows.append(row)
+    document = {"format": _PARTITION_FORMAT, "frame": cells[0].frame.tolist(), "cells": rows}
     other = False
     if file.is_file():
         with open_json(file, "remove it and train again") as before:
@@ -312,19 +308,20 @@ def read_cells(file: Path) -> list[Cell]:
         frame = torch.tensor(document["frame"], dtype=torch.float64).reshape(3, 3)
         found: list[Cell] = []
         for each in document["cells"]:
-            found.append(
-                Cell(
-                    low=_corner(each["low"], -math.inf),
-                    high=_corner(each["high"], math.inf),
-                    border=_corner(each["border"], 0.0),
-                    frame=frame,
-                    windows={
-                        v: (x, y, w, h)
-                        for v, x, y, w, h in from_json(each["windows"], _Windows, path="windows")
-                    },
-                )
-            )
+            windows: dict[int, Window] = {}
+            for view, *window in from_json(each["windows"], _Windows, path="windows"):
+                left, top, width, height = window
+                windows[view] = (left, top, width, height)
+            low = _corner(each["low"], -math.inf)
+            high = _corner(each["high"], math.inf)
+            border = _corner(each["border"], 0.0)
+            found.append(Cell(low=low, high=high, border=border, frame=frame, windows=windows))
         return found
+
+
+def _finite(corner: Annotated[Tensor, "3"]) -> list[float | None]:
+    """Numbers of a corner; None for infinite ones, which JSON does not know."""
+    return [x if math.isfinite(x) else None for x in corner.tolist()]
 
 
 def _corner(values: object, infinite: float) -> Annotated[Tensor, "3"]:

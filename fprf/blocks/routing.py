@@ -87,12 +87,14 @@ class Chart:
         key = (points.dtype, points.device)
         if key not in self._copies:
             with torch.inference_mode(False):
-                low = self.low
-                high = self.high
-                middle, half, low, high = (
-                    each.to(points) for each in ((low + high) / 2, (high - low) / 2, low, high)
+                middle = (self.low + self.high) / 2
+                half = (self.high - self.low) / 2
+                self._copies[key] = (
+                    middle.to(points),
+                    half.to(points),
+                    self.low.to(points),
+                    self.high.to(points),
                 )
-                self._copies[key] = middle, half, low, high
         return self._copies[key]
 
     @cached_property

@@ -121,7 +121,7 @@ def _widened(cells: Sequence[Cell], scene: ParsedScene) -> list[Cell]:
     shows.
     """
     widened: list[dict[int, Window]] = [{} for _ in cells]
-    for view in sorted({view for cell in cells for view in cell.windows}):
+    for view in sorted(set().union(*(cell.windows for cell in cells))):
         own = [k for k, cell in enumerate(cells) if view in cell.windows]
         window = np.array([cells[k].windows[view] for k in own])
         lows = window[:, :2]

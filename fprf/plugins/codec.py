@@ -171,9 +171,10 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         hints = _items(hint, len(items))
         if len(items) != len(hints):
             raise ConfigError(f"{path}: expected {len(hints)} values, found {len(items)}")
-        return origin(
-            _read(v, h, f"{path}.{i}", packages) for i, (v, h) in enumerate(zip(items, hints, strict=True))
-        )
+        values = []
+        for i, (item, hint) in enumerate(zip(items, hints, strict=True)):
+            values.append(_read(item, hint, f"{path}.{i}", packages))
+        return origin(values)
     if origin is dict:
         found = {}
         for k, v in _expect(data, dict, path).items():
@@ -255,11 +256,11 @@ def _expect(data: Any, kind: type | tuple[type, ...], path: str) -> Any:
     """The datum itself if it is exactly of that type: a bool is no int, 1.0 is no int, "5" is no number."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if type(data) not in kinds:
-        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {_shown(json.dumps(data))}")
+        raise ConfigError(f"{path}: expected {_JSON_KINDS[kinds[0]]}, found {_shown(json.dumps(data))}")
     return data
 
 
-_NAMES = {
+_JSON_KINDS = {
     bool: "true or false",
     int: "a whole number",
     float: "a number",
@@ -267,6 +268,7 @@ _NAMES = {
     dict: "an object",
     list: "a list",
 }
+"""What messages call the kinds of JSON."""
 
 
 def packages_of(config: object) -> dict[str, str]:

@@ -194,10 +194,10 @@ def _scan() -> tuple[Mapping[str, Mapping[str, tuple[Entry, ...]]], tuple[str, .
         for point in points:
             if point.group.startswith(_PREFIX):
                 entries.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
-    groups = {
-        group: MappingProxyType(
-            {name: tuple(sorted(names[name], key=lambda each: each.package)) for name in sorted(names)}
-        )
-        for group, names in entries.items()
-    }
+    groups = {}
+    for group, names in entries.items():
+        ordered = {}
+        for name in sorted(names):
+            ordered[name] = tuple(sorted(names[name], key=lambda each: each.package))
+        groups[group] = MappingProxyType(ordered)
     return MappingProxyType(groups), tuple(complaints)

@@ -55,4 +55,6 @@ def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
 
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
+"""Mean red, green and blue of ImageNet, sRGB in [0, 1]: what networks trained on it expect to be taken off."""
 IMAGENET_STD = (0.229, 0.224, 0.225)
+"""Their standard deviations, by which these networks expect colours to be divided."""

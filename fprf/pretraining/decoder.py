@@ -204,7 +204,9 @@ def restyling_losses(
 
 
 REPORT_PHOTOS = 20
-LONGEST = 384
+"""Held-out photographs that a decoder is measured on, at most: bounds the time."""
+LONGEST_PIXELS = 384
+"""Longest side at which photographs are encoded; by eye."""
 
 
 def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[[str], None]) -> Report:
@@ -220,7 +222,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     # Pixels of all photographs, on the CPU: they may be more than an accelerator holds.
     parts = []
     for index, path in enumerate(photos):
-        photo = load_photo(path, LONGEST).to(device)
+        photo = load_photo(path, LONGEST_PIXELS).to(device)
         pixels = random_pixels(photo, config.pixels, generator_of(config.seed + 1, index))
         parts.append([each.cpu() for each in filtered_at(encoder, photo, pixels)])
     features, colours = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -238,7 +240,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
             network,
             chosen,
             side=config.size,
-            longest=LONGEST,
+            longest=LONGEST_PIXELS,
             seed=seed,
             measure=True,
             device=device,
@@ -294,7 +296,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
             network,
             chosen,
             side=config.size,
-            longest=LONGEST,
+            longest=LONGEST_PIXELS,
             seed=seed,
             measure=False,
             device=device,
@@ -312,7 +314,7 @@ def decoder_report(
     """
     psnr = []
     for path in photos:
-        photo = load_photo(path, LONGEST).to(device)
+        photo = load_photo(path, LONGEST_PIXELS).to(device)
         content = filtered_whole(encoder, photo)
         error = float(double(decoder(content) - photo.flatten(0, 1)).square().mean())
         psnr.append(-10 * math.log10(max(error, 1e-10)))
@@ -328,8 +330,10 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     """Content and style loss of every crop in the style of the next one, in the units of `network`."""
     count = len(crops.mean)
     index = torch.arange(count, device=crops.mean.device)
-    losses = []
+    content = 0.0
+    style = 0.0
     for i in index:
-        losses.append(restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count))
-    content, style = (sum(float(each) for each in column) / count for column in zip(*losses, strict=True))
-    return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
+        losses = restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count)
+        content += float(losses[0])
+        style += float(losses[1])
+    return {"content_loss": round(content / count, 4), "style_loss": round(style / count, 4)}

@@ -25,9 +25,10 @@ from .photos import find_photos
 
 WARM_UP = 0.02
 """Share of the run in which the rate rises."""
-_SAVED = 60.0
-_SPOKEN = 15.0
-"""Seconds between checkpoints, and between lines of progress."""
+_CHECKPOINT_SECONDS = 60.0
+"""Time between checkpoints: what an interrupt costs; by eye."""
+_SPOKEN_SECONDS = 15.0
+"""Time between lines of progress; by eye."""
 
 
 def generator_of(seed: int, step: int) -> torch.Generator:
@@ -103,13 +104,15 @@ def train(
     def report(event: Report) -> None:
         nonlocal spoken
         now = time.monotonic()
-        if now - spoken > _SPOKEN:
+        if now - spoken > _SPOKEN_SECONDS:
             say(f"step {event.step}  {100 * event.share:.0f} %  loss {event.losses['loss']:.5f}")
             spoken = now
 
     # The folder is a run's, as far as the driver needs one.
     run = Run(training_folder(output))
-    schedule = Schedule(config.steps, None if config.steps is not None else config.minutes, _SAVED / 60)
+    schedule = Schedule(
+        config.steps, None if config.steps is not None else config.minutes, _CHECKPOINT_SECONDS / 60
+    )
     photos = []
     for path in find_photos(config.images)[: config.photos]:
         photos.append(zlib.crc32(path.read_bytes()))

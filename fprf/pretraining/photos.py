@@ -36,7 +36,9 @@ def find_photos(folders: Sequence[Path]) -> list[Path]:
             raise DataError(
                 f"{folder}: no such folder of photographs; name existing ones with --images DIR ..."
             )
-    photos = [path for folder in folders for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+    photos = []
+    for folder in folders:
+        photos += [path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
     if len(photos) < 2:
         listed = ", ".join(str(folder) for folder in folders) or "no folder"
         raise DataError(

@@ -62,10 +62,11 @@ FILE = "block.safetensors"
 RAYS = "rays.safetensors"
 """In a block's folder: `views` [M] and their tiles `seen` [M TILES TILES] that it learns from."""
 SHARE = 0.2
-"""Share of a time limit that the surroundings take; the blocks share the rest."""
+"""Share of a time limit that the surroundings take; the blocks share the rest. By eye."""
 WARM_UP = 20
 """Most steps of warm-up of a block: what it inherits is no random start, only Adam's averages are new."""
 _MIB = 1 << 20
+"""Bytes of a MiB."""
 
 
 class Built(NamedTuple):

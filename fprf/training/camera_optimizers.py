@@ -23,7 +23,7 @@ from ..rendering.cameras import Cameras
 from ..types import Rays
 from .facts import Facts
 
-_TINY = 1e-24
+_MIN_SQUARED_ANGLE = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
 
 
@@ -111,7 +111,7 @@ def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
 def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
     """Vectors turned by rotation vectors (Rodrigues), differentiable at 0 too."""
     square = turn.square().sum(-1, keepdim=True)
-    angle = (square + _TINY).sqrt()
+    angle = (square + _MIN_SQUARED_ANGLE).sqrt()
     across = torch.linalg.cross(turn, x)
     # (1 - cos a) / a^2 by the half angle: 1 - cos would cancel.
     half = torch.sin(angle / 2) / (angle / 2)
@@ -136,10 +136,9 @@ def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
     columns = []
     for axis in axes:
         columns.append(torch.cat([none, axis.expand_as(place)], -1))
-    columns += [
-        torch.cat([axis.expand_as(place), torch.linalg.cross(axis.expand_as(place), place)], -1)
-        for axis in axes
-    ]
+    for axis in axes:
+        about = axis.expand_as(place)
+        columns.append(torch.cat([about, torch.linalg.cross(about, place)], -1))
     columns.append(torch.cat([none, place], -1))
     matrix = torch.stack([column.reshape(-1) for column in columns], -1)
     if not matrix.numel():

@@ -31,10 +31,14 @@ from .facts import Facts, FieldFacts
 from .model import Model, build_model
 from .views import render_view, view_rays
 
-_DIM = 8
+_SEMANTIC_CHANNELS = 8
+"""Of the tiny scene."""
 _KINDS = 4
-_ALLOWED = {"encoder": 1e-4, "training step": 2e-3, "render": 1e-3, "restyle": 4e-3}
-"""Colours: a quarter of an 8-bit step, of a style, which is made of what encoders say, a whole one."""
+"""Kinds of things in it, each with semantics of its own."""
+_MAX_ERRORS = {"encoder": 1e-4, "training step": 2e-3, "render": 1e-3, "restyle": 4e-3}
+"""Of colours a quarter of an 8-bit step, of a style, which is made of what encoders say, a whole one; of the
+others by eye.
+"""
 
 
 class Outcome(NamedTuple):
@@ -58,7 +62,7 @@ def compare(device: torch.device) -> list[Outcome]:
         expected = _computed(torch.device("cpu"))
     computed = _computed(device)
     outcomes = []
-    for what, allowed in _ALLOWED.items():
+    for what, allowed in _MAX_ERRORS.items():
         away = double(computed[what].cpu()) - double(expected[what])
         like = double(expected[what])
         error = float(away.abs().max() if what in ("render", "restyle") else away.norm() / like.norm())
@@ -100,13 +104,14 @@ def _computed(device: torch.device) -> dict[str, Tensor]:
             field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1),
         ),
         semantic=SemanticConfig(
-            field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=_DIM
+            field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1),
+            dim=_SEMANTIC_CHANNELS,
         ),
         render=RenderConfig(budget=0.0),
     )
     axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
-    of_field = FieldFacts(channels=encoder.channels, dim=_DIM, content_encoder=encoder.identity)
+    of_field = FieldFacts(channels=encoder.channels, dim=_SEMANTIC_CHANNELS, content_encoder=encoder.identity)
     facts = Facts(space=space, field=of_field)
     model = build_model(config, facts).to(device)
     place = torch.tensor([(0.0, -0.4, 0.1)], dtype=torch.float64)
@@ -160,9 +165,9 @@ def _restyle(model: Model, features: Annotated[Tensor, "N C"], image: Annotated[
     classes.
     """
     kinds = torch.arange(len(features), device=features.device) % _KINDS
-    semantic = torch.nn.functional.one_hot(kinds, _DIM).float() + 0.05 * _uniform(len(features), _DIM).to(
-        features
-    )
+    semantic = torch.nn.functional.one_hot(kinds, _SEMANTIC_CHANNELS).float() + 0.05 * _uniform(
+        len(features), _SEMANTIC_CHANNELS
+    ).to(features)
     colour = torch.nn.functional.interpolate(image[None], (24, 32), mode="area")[0].flatten(1).T
     dictionary = build_dictionary([Reference("picture", features, semantic, colour=colour)], clusters=_KINDS)
     scene = scene_style(0.5 * features + 0.2, semantic, torch.ones_like(features[:, 0]), None, _KINDS, 0)

@@ -40,7 +40,7 @@ from .prepare import device_of, planned, read_whole_scene, scene_at_size
 from .run import Run
 
 REPORT_SECONDS = 0.5
-"""Time between reports."""
+"""Time between reports; by eye."""
 PATIENCE = 3
 """Steps in a row that are not finite after which a run goes back to its last checkpoint: it will not recover
 by itself.
@@ -48,15 +48,17 @@ by itself.
 WATCHED = ".watched"
 """File of a run folder that whoever looks at a training touches every second."""
 _WATCH_SECONDS = 5.0
+"""Age up to which that file says that somebody looks."""
 _SAVING_SHARE = 0.05
+"""Share of the time that checkpoints may take while somebody looks; by eye."""
 _MIN_PAUSE = 2.0
-"""Age up to which that file says that somebody looks; the share of the time that checkpoints may then take,
-and the least seconds between them.
+"""Seconds between checkpoints, at least, while somebody looks."""
+_MIN_REDUCED_PIXELS = 96
+"""Pixels of an image's shorter side below which a `--downscale` that was asked for is probably a mistake; by
+eye.
 """
-_SMALL = 96
-"""Pixels of an image's shorter side below which a `--downscale` that was asked for is probably a mistake."""
-_SHOWN = 4
-"""Differences of a run's config that a message names."""
+_MAX_DIFFERENCES = 4
+"""Differences of a run's config that a message names, at most."""
 
 
 class Schedule(NamedTuple):
@@ -170,9 +172,11 @@ def learn(
     # All draws are functions of (seed, step): a resumed training is bit for bit the one that never stopped.
     saved = None if run is None else _resume(learner, run)
     if saved is not None:
-        step, seconds_before = (saved.step, saved.seconds)
+        step = saved.step
+        seconds_before = saved.seconds
     else:
-        step, seconds_before = (0, spent)
+        step = 0
+        seconds_before = spent
     # `step` steps are made, `clock` seconds used.
     first = step
     clock = seconds_before
@@ -328,11 +332,9 @@ class _SignalHandler:
         if threading.current_thread() is threading.main_thread():
             # Windows has SIGBREAK for a process group of its own.
             held = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGBREAK", signal.SIGTERM)}
-            self.before = {
-                number: signal.signal(number, self.note)
-                for number in held
-                if signal.getsignal(number) is not None
-            }
+            for number in held:
+                if signal.getsignal(number) is not None:
+                    self.before[number] = signal.signal(number, self.note)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -410,7 +412,7 @@ def _sized(run: Run, config: RunConfig, display: Display, whole: ParsedScene) ->
     """
     if config.downscale is not None and config.downscale > 1 and not run.exists:
         width, height = scene_at_size(config, whole).cameras.size[0].tolist()
-        if min(width, height) < _SMALL:
+        if min(width, height) < _MIN_REDUCED_PIXELS:
             display.say(
                 f"warning: {width}x{height} pixels are few: --downscale {config.downscale:g} counts from the images as they "
                 "are delivered, also in a folder images_N; leave it out"
@@ -453,17 +455,16 @@ def _check_same(run: Run, config: RunConfig) -> None:
     # Whole branches of the config may be free: what is compared are its leaves, by their paths.
     mine = leaves(config)
     theirs = leaves(old)
-    changed = [
-        path
-        for path in theirs | mine
-        if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)
-    ]
+    changed = []
+    for field in theirs | mine:
+        if field.partition(".")[0] not in free and mine.get(field) != theirs.get(field):
+            changed.append(field)
     if changed:
         shown = []
-        for name in changed[:_SHOWN]:
+        for name in changed[:_MAX_DIFFERENCES]:
             shown.append(f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)")
-        if len(changed) > _SHOWN:
-            more = f" and {len(changed) - _SHOWN} others"
+        if len(changed) > _MAX_DIFFERENCES:
+            more = f" and {len(changed) - _MAX_DIFFERENCES} others"
         else:
             more = ""
         # The first free name after this one, so that the line can be copied.

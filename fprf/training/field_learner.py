@@ -122,12 +122,11 @@ class FieldLearner(SceneLearner):
         # are now.
         with record_function("fprf.batch"):
             drawn = self.batches(step)
-            here = (
-                drawn._replace(pixel=drawn.pixel.float()) if self.device.type == "mps" else drawn
-            )  # which has no float64
-            batch = Batch._make(
-                x if x is None else x.to(self.device, non_blocking=self.device.type == "cuda") for x in here
-            )
+            here = drawn
+            if self.device.type == "mps":  # which has no float64
+                here = drawn._replace(pixel=drawn.pixel.float())
+            ahead = self.device.type == "cuda"
+            batch = Batch._make(x if x is None else x.to(self.device, non_blocking=ahead) for x in here)
             rays, ends = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)

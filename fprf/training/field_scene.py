@@ -115,10 +115,10 @@ class Trained(Scene):
             reach = reach_of(captured, facts.space)
         for done, view in enumerate(views):
             progress(done, len(views), "fitting poses")
-            truth, where = self.known.photograph(captured, view, masks=self.config.reading.masks)
+            photograph = self.known.photograph(captured, view, masks=self.config.reading.masks)
             budget = self.config.render.budget
             moves[view] = fit_pose(
-                self.model, facts, self.cameras, view, truth, where, reach=reach, budget=budget
+                self.model, facts, self.cameras, view, photograph, reach=reach, budget=budget
             )
         progress(len(views), len(views), "fitting poses")
         return moves

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 from ..errors import CheckpointError
 from ..io.strict_json import parse_json
 
-_LARGEST = 3.4e38
+_MAX_FIGURE = 3.4e38
 """Figure up to which a line is believed: training computes in float32, and sums of larger ones overflow."""
-_LAST = 2**63
+_MAX_STEP = 2**63
 """Step below which a line is believed: charts take 64-bit numbers."""
 
 
@@ -33,11 +33,9 @@ def read_history(run: Path) -> list[History]:
     Where a run was resumed from an earlier step, the later steps of the first try are dropped. Raises
     CheckpointError where there is no line at all.
     """
-    parts = ("overview", "blocks/*", "cells/*")
-    files = [
-        run / "events.jsonl",
-        *(file for part in parts for file in sorted(run.glob(f"{part}/events.jsonl"))),
-    ]
+    files = [run / "events.jsonl"]
+    for part in ("overview", "blocks/*", "cells/*"):
+        files += sorted(run.glob(f"{part}/events.jsonl"))
     histories = []
     for file in files:
         if file.is_file():
@@ -62,7 +60,7 @@ def _history(name: str, file: Path) -> History:
         if not isinstance(event, dict):
             continue
         step = event.get("step")
-        if type(step) is int and abs(step) < _LAST and _number(event.get("seconds")) is not None:
+        if type(step) is int and abs(step) < _MAX_STEP and _number(event.get("seconds")) is not None:
             # After a resume the steps come again.
             while lines and lines[-1]["step"] >= step:
                 lines.pop()
@@ -70,18 +68,22 @@ def _history(name: str, file: Path) -> History:
         else:
             notes.append(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in event.items()))
     # Losses stand beside the other figures of their line; what a line does not say is None.
-    flat = [
-        {**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines
-    ]
-    known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
-    values = {}
-    for key in known:
-        values[key] = [_number(event.get(key)) for event in flat]
+    flat = []
+    values: dict[str, list[float | None]] = {}
+    for event in lines:
+        losses = event.get("losses")
+        whole = event | losses if isinstance(losses, dict) else event
+        flat.append(whole)
+        for key in whole:
+            if key not in ("step", "seconds", "losses"):
+                values[key] = []
+    for key, column in values.items():
+        column += [_number(event.get(key)) for event in flat]
     return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, notes)
 
 
 def _number(value: object) -> float | None:
     """A figure as training writes it; None for anything else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _MAX_FIGURE:
         return None
     return float(value)

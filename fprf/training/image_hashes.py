@@ -18,7 +18,7 @@ CHANGED_IMAGES = "--changed-images"
 """Flag of `fprf train` that goes on with images that have changed."""
 _IMAGES_FORMAT = 1
 """Version of images.json."""
-_NAMED = 3
+_MAX_LISTED = 3
 """Images that a message names, at most."""
 
 
@@ -62,11 +62,11 @@ def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> N
     changed += [f"{files[name]} is new" for name in hashes if name not in before]
     changed += [f"{name} is gone" for name in before if name not in hashes]
     if changed:
-        if len(changed) > _NAMED:
-            more = f" and {len(changed) - _NAMED} more"
+        if len(changed) > _MAX_LISTED:
+            more = f" and {len(changed) - _MAX_LISTED} more"
         else:
             more = ""
         raise UsageError(
-            f"{root}: its images have changed since it was begun: {', '.join(changed[:_NAMED])}{more}; put them back, "
+            f"{root}: its images have changed since it was begun: {', '.join(changed[:_MAX_LISTED])}{more}; put them back, "
             f"choose another --output, or go on with these by {CHANGED_IMAGES}"
         )

@@ -120,12 +120,11 @@ def terms(
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)
     # Regularisers of all parameters cost as much as a batch, and need not follow every one.
-    if step % config.penalty_every == 0 and any(
-        _penalty_weight(config, name) > 0 for name in model.penalty_names
-    ):
-        result |= {
-            name: value for name, value in model.penalties().items() if _penalty_weight(config, name) > 0
-        }
+    wanted_penalties = {name for name in model.penalty_names if _penalty_weight(config, name) > 0}
+    if step % config.penalty_every == 0 and wanted_penalties:
+        for name, value in model.penalties().items():
+            if name in wanted_penalties:
+                result[name] = value
     return result
 
 
@@ -182,12 +181,11 @@ def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> T
     weights["depth"] *= FADE**share
     # A penalty that is computed in one step of so many weighs as many times more.
     every = config.penalty_every
-    return torch.stack(
-        [
-            (weights[name] if name in weights else _penalty_weight(config, name) * every) * value
-            for name, value in parts.items()
-        ]
-    ).sum()
+    weighted = []
+    for name, value in parts.items():
+        weight = weights[name] if name in weights else _penalty_weight(config, name) * every
+        weighted.append(weight * value)
+    return torch.stack(weighted).sum()
 
 
 def _weights(config: LossConfig) -> dict[str, float]:

@@ -34,6 +34,7 @@ PRESETS: dict[Name, Preset] = {
     "standard": Preset(merged=2.0),
     "best": Preset(),
 }
+"""What each name stands for; the module says what measured it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -37,11 +37,22 @@ from ..run_config import RunConfig
 from .facts import Facts, facts_from_json, facts_to_json
 
 FORMAT = 1
-_SHOWN = 8
+"""Version of scene.json."""
+_MAX_SOME = 8
 """Views of the split `some`, at most."""
 _CAMERA = {"pose": (3, 4), "focal": (2,), "centre": (2,), "size": (2,), "distortion": (6,), "lens": ()}
 """Fields of the cameras, and the shape of each for one view."""
 _INTEGERS = ("size", "lens")
+"""Those of them that are whole numbers."""
+
+
+class Photograph(NamedTuple):
+    """The image of a view, and where it counts."""
+
+    image: Annotated[Tensor, "H W 3"]
+    """In [0, 1]."""
+    where: Annotated[Tensor, "H W"] | None
+    """True where it counts; None = everywhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +71,7 @@ class Known:
 
     def split(self, name: str) -> tuple[int, ...]:
         """Views of `train`, `test` or `all`; `some`: at most 8 training views, spread evenly."""
-        count = min(_SHOWN, len(self.train))
+        count = min(_MAX_SOME, len(self.train))
         some = tuple(self.train[k * len(self.train) // count] for k in range(count))
         return {"some": some, "train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[
             name
@@ -82,21 +93,18 @@ class Known:
             raise UsageError(f"--split {split}: the run holds no such views; choose another split")
         return views
 
-    def photograph(
-        self, captured: ParsedScene, view: int, *, masks: bool
-    ) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"] | None]:
-        """The image of a view at the size of its camera, in [0, 1], and where it counts by the masks; None =
-        everywhere.
+    def photograph(self, captured: ParsedScene, view: int, *, masks: bool) -> Photograph:
+        """The image of a view at the size of its camera, with `masks` where those of the capture say that it
+        counts.
         """
         width, height = self.cameras.size[view].tolist()
-        image = (
-            torch.from_numpy(load_image(captured.paths[view], (width, height), self.facts.background)).float()
-            / 255
-        )
-        mask = None
-        if captured.masks and masks:
-            mask = captured.masks[view]
-        return image, None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
+        pixels = load_image(captured.paths[view], (width, height), self.facts.background)
+        image = torch.from_numpy(pixels).float() / 255
+        mask = captured.masks[view] if captured.masks and masks else None
+        where = None
+        if mask is not None:
+            where = torch.from_numpy(load_mask(mask, (width, height)))
+        return Photograph(image, where)
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,10 @@ WHOLE = -1
 """The number of the whole scene among the parts."""
 _TASK = "task.json"
 _DONE = "done.json"
-_FORMAT = 1
+_DONE_FORMAT = 1
+"""Version of done.json."""
 _MOVING = "moving-"
+"""Begins the names of folders that change their number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +118,7 @@ def train_part(part: Part, report: Callable[[Report], None]) -> bool:
         begin(part.folder, part.asked["task"])
         learner = part.build()
         step, seconds = learn(learner, Run(part.folder), part.schedule, report)
-        document = {"format": _FORMAT, "asked": part.asked, "step": step, "seconds": seconds}
+        document = {"format": _DONE_FORMAT, "asked": part.asked, "step": step, "seconds": seconds}
         write_json(part.folder / _DONE, document | {"tensors": part.keep(learner)})
     return True
 
@@ -219,7 +221,7 @@ def read_done(folder: Path) -> Done | None:
     if not file.is_file():
         return None
     with open_json(file, "remove it and train again") as document:
-        if document["format"] == _FORMAT:
+        if document["format"] == _DONE_FORMAT:
             return from_json(document, Done, path="done")
         return None
 

@@ -29,6 +29,7 @@ from ..types import Rays, View, Want
 from .camera_optimizers import rays_of_moving_cameras, rotated
 from .facts import Facts
 from .model import Model, background_of
+from .run import Photograph
 
 
 def view_rays(
@@ -44,9 +45,8 @@ def view_rays(
     if pixel is None:
         origin, direction = grid_rays(cameras, view, wide)
     else:
-        origin, direction = (
-            x.to(wide) for x in rays_through(cameras, torch.full((len(pixel),), view), pixel)
-        )
+        through = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+        origin, direction = (x.to(wide) for x in through)
     return Rays(*(x.to(device) for x in model.space.rays(origin, direction))), origin, direction
 
 
@@ -250,10 +250,9 @@ def paint_pixels(
 FIT_STEPS = 120
 """Steps of Adam that fit the pose of a view."""
 _FIT_RAYS = 512
-_FIT_RATE = 2e-3
-"""Pixels of such a step; radians, and distances that views commonly see, of the first one, falling along a
-cosine to none.
-"""
+"""Pixels of such a step; by eye."""
+_FIRST_FIT_RATE = 2e-3
+"""Radians, and distances that views commonly see, of the first step; it falls along a cosine to none."""
 
 
 def fit_pose(
@@ -261,19 +260,19 @@ def fit_pose(
     facts: Facts,
     cameras: Cameras,
     view: int,
-    truth: Annotated[Tensor, "H W 3"],
-    where: Annotated[Tensor, "H W"] | None,
+    photograph: Photograph,
     *,
     reach: float,
     budget: float,
 ) -> Annotated[Tensor, "6"]:
-    """Turn and shift (world units), float64, that bring the render of a view nearest to its image, `where`
+    """Turn and shift (world units), float64, that bring the render of a view nearest to its photograph, where
     that counts.
 
     Where training refines poses the scene moves with the training views, and a held-out view stays where the
     capture says: its pose is fitted to its own image (BARF, section 4), six numbers a view. The scene is not
     changed.
     """
+    truth, where = photograph
     device = model.device
     tones = model.tones
     through = PixelRays(cameras.select(torch.tensor([view])))
@@ -289,10 +288,10 @@ def fit_pose(
     if not (where is None or not bool(where.any())):
         used = where.reshape(-1).nonzero()[:, 0]
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.Adam([move], lr=_FIT_RATE, betas=(0.9, 0.95))
+    optimizer = torch.optim.Adam([move], lr=_FIRST_FIT_RATE, betas=(0.9, 0.95))
     # A few random pixels a step are enough for six numbers.
     for step in range(FIT_STEPS):
-        optimizer.param_groups[0]["lr"] = 0.5 * _FIT_RATE * (1 + math.cos(math.pi * step / FIT_STEPS))
+        optimizer.param_groups[0]["lr"] = 0.5 * _FIRST_FIT_RATE * (1 + math.cos(math.pi * step / FIT_STEPS))
         at = torch.randint(len(pixels) if used is None else len(used), (_FIT_RAYS,), generator=generator)
         at = at if used is None else used[at]
         pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.errors import CheckpointError, DataError, UsageError
+from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
+from fprf.training.facts import facts_from_json, facts_to_json
 from fprf.training.history import read_history
 from fprf.training.image_hashes import IMAGES, check_images, image_hashes, save_image_hashes
 from fprf.training.locks import LOCK, lock_folder
@@ -163,3 +164,19 @@ def test_what_is_absent_or_damaged_is_refused(world: World, run: Run) -> None:
         check_images(run.root, scene, image_hashes(scene))
     with pytest.raises(DataError):
         image_hashes(replace(scene, paths=(run.root / "gone.png",)))
+
+
+def test_facts_of_fields_are_told_from_those_of_a_scene(world: World) -> None:
+    facts = world.prepared.facts
+    document = facts_to_json(facts)
+    assert facts.field is not None and document["channels"] == facts.field.channels
+    assert facts_from_json(json.loads(json.dumps(document))) == facts
+    bare = replace(facts, field=None)
+    assert not {"field", "channels"} & facts_to_json(bare).keys()
+    # Scenes of Gaussians from before the two were told apart hold empty facts of fields.
+    before = {"channels": 0, "dim": 0, "content_encoder": "", "content_scale": 1.0}
+    assert facts_from_json(json.loads(json.dumps(facts_to_json(bare) | before))) == bare
+    with pytest.raises(CheckpointError, match="fields"):
+        _ = bare.of_field
+    with pytest.raises(ConfigError, match="channels"):
+        facts_from_json(json.loads(json.dumps(document | {"channels": 2**20})))

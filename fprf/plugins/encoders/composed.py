@@ -69,11 +69,13 @@ class ConcatEncoder(FrozenEncoder):
                 least.append((min(each.shape[2], size[0]), min(each.shape[3], size[1])))
             maps = [F.adaptive_avg_pool2d(each, cells) for each, cells in zip(maps, least, strict=True)]
             return torch.cat([F.interpolate(each, size, mode="bilinear") for each in maps], dim=1)
-        size = torch.Size(max(each.shape[axis] for each in maps) for axis in (2, 3))
-        fine = (
-            each if each.shape[2:] == size else F.interpolate(each, size, mode="bilinear") for each in maps
-        )
-        return torch.cat(list(fine), dim=1)
+        height = max(each.shape[2] for each in maps)
+        width = max(each.shape[3] for each in maps)
+        size = torch.Size((height, width))
+        fine = []
+        for each in maps:
+            fine.append(each if each.shape[2:] == size else F.interpolate(each, size, mode="bilinear"))
+        return torch.cat(fine, dim=1)
 
 
 UNITS: Mapping[str, float] = {

@@ -21,13 +21,17 @@ from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
 from .frozen import CELLS, FrozenEncoder, freeze, patch_grid
 
 PATCH = 14
+"""Pixels of a patch's side, as in training."""
 WIDTH = 384
+"""Channels of the smallest DINOv2 (ViT-S)."""
 HEADS = 6
+"""Heads of attention of the smallest DINOv2."""
 GRID = 37
 """Rows and columns of the learned positions."""
 HELD = 11
+"""Blocks in the file that ships."""
 BLOCKS = 12
-"""Blocks in the file and of the network."""
+"""Blocks of the network."""
 EPS = 1e-6
 """Of layer norms, as in training."""
 COVER = 0.02
@@ -134,12 +138,11 @@ class Dinov2Encoder(FrozenEncoder):
         cover = F.adaptive_avg_pool2d(opacity[:, None], patch_grid(image.shape[-2:], self._stride))[:, 0]
         filled = image + (1 - opacity[:, None]) * GREY
         # One by one: as many tokens as each image shows.
-        return torch.cat(
-            [
-                self._features(each, shown if bool(shown.any() & ~shown.all()) else None)
-                for each, shown in zip(torch.split(filled, 1), cover > COVER, strict=True)
-            ]
-        )
+        features = []
+        for each, shown in zip(torch.split(filled, 1), cover > COVER, strict=True):
+            partly = bool(shown.any() & ~shown.all())
+            features.append(self._features(each, shown if partly else None))
+        return torch.cat(features)
 
     def _features(
         self, image: Tensor, shown: Annotated[Tensor, "h w"] | None = None

@@ -29,10 +29,13 @@ from ..config import Need, absent_file
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
 from .frozen import FrozenEncoder, freeze, reflect_pad, street
 
-_NAMES = [
+_CONVOLUTION_NAMES = [
     f"{block}_{index}" for block, depth in enumerate((2, 2, 4, 4, 4), 1) for index in range(1, depth + 1)
 ]
-CONVOLUTIONS: Mapping[str, int] = {name: 2 * at + int(name[0]) - 1 for at, name in enumerate(_NAMES)}
+"""Names of the convolutions, block by block."""
+CONVOLUTIONS: Mapping[str, int] = {
+    name: 2 * at + int(name[0]) - 1 for at, name in enumerate(_CONVOLUTION_NAMES)
+}
 """Place of each convolution in torchvision's `features`: with its ReLU it takes two, a pool one after each
 block.
 """
@@ -54,7 +57,7 @@ class VggEncoder(FrozenEncoder):
         source: str,
     ) -> None:
         # Tensors of the convolutions up to the layer, each of which the file must hold.
-        names = _NAMES[: _NAMES.index(layer[4:]) + 1]
+        names = _CONVOLUTION_NAMES[: _CONVOLUTION_NAMES.index(layer[4:]) + 1]
         used = {"mean": mean.float(), "std": std.float()}
         for index, name in enumerate(names):
             for part in ("weight", "bias"):
@@ -125,7 +128,9 @@ FILE = "vgg19-dcbb9e9d.pth"
 ORIGIN = f"https://download.pytorch.org/models/{FILE}"
 """torchvision's file: its name carries the beginning of its own SHA-256."""
 CHUNK = 1 << 20
+"""Bytes that are downloaded at a time: an interrupt waits for no more."""
 TIMEOUT_SECONDS = 30
+"""Seconds of silence after which a download is given up; by eye."""
 RAREST = 0.05
 """Mean activation of the rarest filters, as a share of the mean over all: on photographs none of VGG-19 is
 below that.

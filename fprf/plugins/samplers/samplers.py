@@ -20,9 +20,9 @@ class ProposalSampler(Sampler):
     def __init__(self, config: ProposalConfig, *, seed: int) -> None:
         super().__init__()
         self.config = config
-        self.levels = nn.ModuleList(
-            ProposalField(r, config.channels, seed=seed + i) for i, r in enumerate(config.resolutions)
-        )
+        self.levels = nn.ModuleList()
+        for level, resolution in enumerate(config.resolutions):
+            self.levels.append(ProposalField(resolution, config.channels, seed=seed + level))
 
     @property
     def fields(self) -> nn.ModuleList:

@@ -27,11 +27,10 @@ from ...style.statistics import deviation, monge
 from ...types import Want
 from .config import RegionConfig
 
-_UNMATCHED = 0.1
-_MATCHED = 0.4
-"""Cosines with the nearest code, from the scene's mean: up to the first a region is unmatched, from the
-second on matched.
-"""
+_UNMATCHED_COSINE = 0.1
+"""Cosine with the nearest code, from the scene's mean, up to which a region is unmatched; by eye."""
+_MATCHED_COSINE = 0.4
+"""Cosine from which on it is matched; by eye."""
 _SIMILAR = 0.2
 """Squared distance of contents, in total variances of the scene, at which the weight of another region falls
 to 1/e.
@@ -68,7 +67,7 @@ def region_table(
     # Whether the references show such a thing at all is asked from the scene's mean: centred on its own, each
     # side always fits.
     score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
-    trust = ((double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED)).clamp(0, 1)
+    trust = ((double(score) - _UNMATCHED_COSINE) / (_MATCHED_COSINE - _UNMATCHED_COSINE)).clamp(0, 1)
     mean = double(scene.region_mean)
     distance = torch.cdist(mean, mean).square() / double(scene.covariance).trace().clamp_min(1e-12)
     weight = torch.exp(-distance / _SIMILAR) * (trust * double(scene.share))
