@@ -36,7 +36,9 @@ _TEXT = re.compile(
 _GPU = re.compile(r"GPU \d+ has a total capacity of [\d.]+ \w+ of which [\d.]+ \w+ is free")
 _ASKED = re.compile(r"(?:allocate|allocate array of|llocate) ([\d.]+) (bytes|KiB|MiB|GiB|TiB)", re.IGNORECASE)
 _UNITS = {"bytes": 1, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30, "tib": 1 << 40}
+"""Bytes of the units that such texts name."""
 _OPENCV_NO_MEMORY = -4
+"""Code of OpenCV's error StsNoMem."""
 TRIM = 2**29
 """Freed memory beyond this goes back to the system."""
 _LARGEST = (2**27, 2**25)
@@ -44,8 +46,11 @@ _LARGEST = (2**27, 2**25)
 second.
 """
 _TRIM_THRESHOLD = -1
+"""M_TRIM_THRESHOLD of mallopt (glibc's malloc.h)."""
 _MMAP_THRESHOLD = -3
+"""M_MMAP_THRESHOLD of mallopt."""
 _GIB = 1 << 30
+"""Bytes of a GiB."""
 _Found = TypeVar("_Found")
 
 

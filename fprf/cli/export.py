@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..style.look import Restyle
     from ..training.loading import LoadedRun
 
+# Endings come from the formats that are installed, those of packages too.
 _EXPORT_HELP = f"""A scene as files that other programs open, in the capture's own frame.
 
 Kinds may follow the run: {

@@ -22,6 +22,7 @@ _ENCODER_OPTIONS: dict[Format, list[int]] = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92],
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 84],
 }
+"""Settings of OpenCV's encoders: how much PNG is compressed (of 9), quality of the others (of 100); by eye."""
 _PICTURE_ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
 
 

@@ -27,6 +27,7 @@ from .strict_json import parse_json
 RECORD = ".fprf.json"
 """List of the outputs in a folder."""
 _RECORD_FORMAT = 1
+"""Counts up when an older fprf could not read the list."""
 
 _Entry: TypeAlias = dict[str, Any]
 """What the list says of a file; one that is announced, and not yet written, has no size."""

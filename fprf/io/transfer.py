@@ -54,7 +54,9 @@ ADOBE_GAMMA = 563 / 256
 """Exponent of Adobe RGB (1998), section 4.3.4.2."""
 
 _ILLUMINANT_C = (0.310, 0.316)
+"""White of BT.470 System M and of generic film (H.273, table 2)."""
 _SMPTE170: Chromaticities = ((0.630, 0.340), (0.310, 0.595), (0.155, 0.070), D65)
+"""Primaries of SMPTE ST 170 and ST 240, which H.273 numbers 6 and 7."""
 PRIMARIES: dict[int, Chromaticities] = {
     1: BT709,
     4: ((0.67, 0.33), (0.21, 0.71), (0.14, 0.08), _ILLUMINANT_C),  # BT.470 M

@@ -38,6 +38,7 @@ from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
 
 _STYLE_FORMAT = 1
+"""Of style.json: counts up when an older fprf could not read it."""
 _STYLE_KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
 
 RegionKey = tuple[float, ...]

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 Answer = TypeVar("Answer")
 POINTS = 5
+"""Points that a part of a package is tried on: no square, so that axes that are mixed up show."""
 _SLACK = 1e-5
 """Beyond the range of an output that passes for rounding."""
 
