@@ -36,7 +36,7 @@ from ..types import Origin
 
 Report = Callable[[int, int], None]
 
-_MIN_SEEN_OPACITY = 0.5
+_MIN_SURFACE_OPACITY = 0.5
 """Pixels of a smaller opacity see nothing: more of what they show lies behind. By eye."""
 _MAX_DEPTH_RATIO = 1.25
 """Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground
@@ -58,7 +58,7 @@ _MIN_AGREEING_VIEWS = 2
 one alone sees is the air before an edge."""
 _MAX_LATTICE_POINTS = 8_000_000
 """Lattice points: about 1 GB of memory."""
-_MAX_COORDINATE = 1 << 18
+_MAX_LATTICE_COORDINATE = 1 << 18
 """Lattice points to either side of the origin that keys tell apart: three of 19 bits fit int64."""
 _TRUNCATION_EDGES = 3.0
 """Distances are cut at so many edges: beyond, a surface of another side would be met. By eye."""
@@ -116,7 +116,7 @@ def render_maps(scene: Scene, cameras: Cameras, *, side: int, reach: float, repo
     for view in range(len(small)):
         report(view, len(small))
         shown = scene.render(small, view, resolution=1.0)
-        seen = (shown.opacity > _MIN_SEEN_OPACITY) & (shown.depth > 0) & (shown.depth < reach)
+        seen = (shown.opacity > _MIN_SURFACE_OPACITY) & (shown.depth > 0) & (shown.depth < reach)
         maps.depth.append(torch.where(seen, shown.depth, torch.inf))
         maps.rgb.append(shown.rgb)
     report(len(small), len(small))
@@ -226,7 +226,7 @@ def _lattice(
         edge *= 2
     inner = torch.cartesian_prod(*(torch.arange(_CUBE_SIDE),) * 3)
     cell = (block[:, None] * _CUBE_SIDE + inner).view(-1, 3)
-    return cell[cell.abs().amax(1) < _MAX_COORDINATE - 2], origin, edge
+    return cell[cell.abs().amax(1) < _MAX_LATTICE_COORDINATE - 2], origin, edge
 
 
 def _signed_distance(
@@ -288,7 +288,7 @@ def surface_nets(
 ) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "F 3"]]:
     """Vertices in lattice coordinates (float64) and triangles (int64), counter-clockwise seen from outside.
 
-    Lattice points are integers within `_MAX_COORDINATE`, each at most once. What borders on a point without a value is
+    Lattice points are integers within `_MAX_LATTICE_COORDINATE`, each at most once. What borders on a point without a value is
     open.
     """
     if not len(cell):
@@ -346,9 +346,9 @@ def surface_nets(
 
 
 def _keys(cell: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
-    """One integer a lattice point; coordinates must lie within `_MAX_COORDINATE`."""
-    x, y, z = (cell + _MAX_COORDINATE).unbind(-1)
-    return (x * 2 * _MAX_COORDINATE + y) * 2 * _MAX_COORDINATE + z
+    """One integer a lattice point; coordinates must lie within `_MAX_LATTICE_COORDINATE`."""
+    x, y, z = (cell + _MAX_LATTICE_COORDINATE).unbind(-1)
+    return (x * 2 * _MAX_LATTICE_COORDINATE + y) * 2 * _MAX_LATTICE_COORDINATE + z
 
 
 def _components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "count"]:
