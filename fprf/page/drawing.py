@@ -46,7 +46,7 @@ from .state import Look, PageKeyframe, Photograph, RegionInfo, Shown
 
 K = TypeVar("K")
 V = TypeVar("V")
-_THUMBNAIL_PIXELS = 128
+_SHELF_PIXELS = 128
 """Longest side of a photograph on the shelf; by eye."""
 _MAX_KEPT_STYLES = 24
 """Dictionaries and styles that are kept for when somebody returns to them; by eye."""
@@ -107,7 +107,7 @@ class Restyler:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(path, self.encoders, name=name)
         self._photographs += 1
-        thumbnail = load_preview(path, _THUMBNAIL_PIXELS)
+        thumbnail = load_preview(path, _SHELF_PIXELS)
         return Photograph(self._photographs, name, path, thumbnail, reference)
 
     def styled(self, look: Look) -> Styled | None:

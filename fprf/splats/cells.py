@@ -51,7 +51,7 @@ from .pinholes import covering
 from .setup import build, light_and_poses, limit_widths, scene_scale
 from .view_corrections import MOVES, ViewCorrections
 
-Element = TypeVar("Element", bound=np.generic)
+PixelType = TypeVar("PixelType", bound=np.generic)
 _CELL_VERSION = 6
 """Version of how a cell is trained: another one trains it anew."""
 _MOMENTS = ("first", "second", "weight")
@@ -358,7 +358,7 @@ def scene_in_windows(scene: ParsedScene, cell: Cell) -> ParsedScene:
     return replace(scene, cameras=replace(scene.cameras, centre=centre, size=size), train=views)
 
 
-def crop(cell: Cell, images: dict[int, NDArray[Element]]) -> dict[int, NDArray[Element]]:
+def crop(cell: Cell, images: dict[int, NDArray[PixelType]]) -> dict[int, NDArray[PixelType]]:
     """A cell's windows of images [H W ...] by view."""
     cropped = {}
     for view, image in images.items():

@@ -20,7 +20,7 @@ from ..ops.rasterise.training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATER
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
-_MAX_MAGNITUDE = 1e15
+_MAX_DRAWN_MAGNITUDE = 1e15
 """Magnitude from which on nothing is drawn (`ops.rasterise.reference`)."""
 _MAX_LOG_SCALE = 88.0
 """Largest ln-scale whose size is finite in float32: exp(88.7) is its largest number."""
@@ -118,7 +118,7 @@ class Gaussians:
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
         bounded = (self.log_scales <= _MAX_LOG_SCALE).all(1) & ~self.logits.isnan()  # False for NaN
         for part in parts:
-            small = [(rows.abs() < _MAX_MAGNITUDE).all(1) for rows in torch.split(part, _CHECKED_ROWS)]
+            small = [(rows.abs() < _MAX_DRAWN_MAGNITUDE).all(1) for rows in torch.split(part, _CHECKED_ROWS)]
             bounded = bounded & torch.cat(small)
         return bounded, (self.quaternions.abs() >= _MIN_QUATERNION).any(1)
 

@@ -100,9 +100,9 @@ _BLURRED_EVERY_EPOCHS = 8
 to 28.6 dB if all are shown alike, 29.1 without the eight, and 29.2 so; had none moved, to 29.7
 (blurred.json).
 """
-_MIN_OPACITY = 0.005
+_MIN_LIVE_OPACITY = 0.005
 """Opacity below which a Gaussian is moved elsewhere: that of Kerbl et al. and of 3DGS-MCMC."""
-_MAX_OPACITY = 0.995
+_MAX_HALF_OPACITY = 0.995
 """Largest opacity of a half: beyond it gradients vanish; by eye."""
 _MAX_SKY_SHARE = 0.7
 """Share of a Gaussian's weight in sky from which on it is moved; by eye."""
@@ -341,7 +341,7 @@ class GaussianLearner(SceneLearner):
         chance = np.nan_to_num(error * opacity)
         # Used again elsewhere: what is transparent, and what shows almost only in the sky and so floats
         # before it.
-        reusable = (opacity < _MIN_OPACITY) | (sky > _MAX_SKY_SHARE * np.maximum(seen, _MIN_SKY_PIXELS))
+        reusable = (opacity < _MIN_LIVE_OPACITY) | (sky > _MAX_SKY_SHARE * np.maximum(seen, _MIN_SKY_PIXELS))
         if self.bounds.inside is not None:
             inside = self.bounds.inside(torch.from_numpy(model.read(MEANS))).numpy()
             chance = chance * inside
@@ -442,7 +442,7 @@ def halves(
     across = turns[which, :, longest] * np.exp(size)[:, None]
     # Both halves are alike: shorter along that axis, and fainter, as they overlap.
     first[which, LOG_SCALES.start + longest] += math.log(_HALF_WIDTH_SHARE)
-    each = np.clip(_HALF_OPACITY_SHARE * opacity, _MIN_OPACITY, _MAX_OPACITY)
+    each = np.clip(_HALF_OPACITY_SHARE * opacity, _MIN_LIVE_OPACITY, _MAX_HALF_OPACITY)
     first[:, LOGIT] = np.log(each / (1 - each))[:, None]
     # They lie on either side of the middle.
     second = first.copy()

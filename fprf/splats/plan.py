@@ -49,9 +49,9 @@ _MAX_UNTIMED_SECONDS = 600.0
 
 # What the number of Gaussians is decided by.
 
-_MIN_GAUSSIANS = 60_000
+_MIN_PLANNED_GAUSSIANS = 60_000
 """Gaussians of a minute, and of less."""
-_MAX_GAUSSIANS = 1_000_000
+_MAX_PLANNED_GAUSSIANS = 1_000_000
 """Gaussians of any time, at most: bounds the memory, 0.6 GB in training (training_steps.json)."""
 _GROWTH_POWER = 0.6
 """Power of the time that the number of Gaussians grows with; by eye: 160 000 in five minutes, with which
@@ -110,7 +110,7 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
     while True:
         small = pixels / size**2
         found = _of_size(config, small)
-        each = _seconds(found, small, _MIN_GAUSSIANS)
+        each = _seconds(found, small, _MIN_PLANNED_GAUSSIANS)
         steps = found.limited(views)
         times = speed(_share(found) * small)
         if budget is None:
@@ -128,9 +128,9 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
         seconds = min(budget * times, steps * each)
     cap = config.cap
     if cap is None:
-        wanted = _MIN_GAUSSIANS / _GAUSSIANS_STEP * (seconds / 60) ** _GROWTH_POWER
+        wanted = _MIN_PLANNED_GAUSSIANS / _GAUSSIANS_STEP * (seconds / 60) ** _GROWTH_POWER
         cap = _GAUSSIANS_STEP * round(wanted)
-        cap = min(_MAX_GAUSSIANS, max(_MIN_GAUSSIANS, cap))
+        cap = min(_MAX_PLANNED_GAUSSIANS, max(_MIN_PLANNED_GAUSSIANS, cap))
         if not config.cells.cuts:
             cap = min(cap, max(1, int(views * pixels / size**2) // config.pixels_per_gaussian))
     return replace(found, downscale=size, cap=cap)
@@ -179,12 +179,12 @@ def _card_speed(device: torch.device) -> Callable[[float], float]:
     """The same of a CUDA device on which gsplat draws, by some steps there."""
     draw = np.random.default_rng(0)
     # Gaussians before a camera, about as wide as they lie apart.
-    rows = 0.1 * draw.standard_normal((_MIN_GAUSSIANS, 59), np.float32)
-    depth = draw.uniform(2, 8, _MIN_GAUSSIANS)
-    rows[:, :2] = draw.uniform(-0.6, 0.6, (_MIN_GAUSSIANS, 2)) * depth[:, None]
+    rows = 0.1 * draw.standard_normal((_MIN_PLANNED_GAUSSIANS, 59), np.float32)
+    depth = draw.uniform(2, 8, _MIN_PLANNED_GAUSSIANS)
+    rows[:, :2] = draw.uniform(-0.6, 0.6, (_MIN_PLANNED_GAUSSIANS, 2)) * depth[:, None]
     rows[:, 2] = depth
     rows[:, 3:6] += np.log(3e-3 * depth)[:, None]
-    model = trainable(_MIN_GAUSSIANS, 16, device)
+    model = trainable(_MIN_PLANNED_GAUSSIANS, 16, device)
     model.start(rows)
     pixels = []
     seconds = []
@@ -204,7 +204,7 @@ def _card_speed(device: torch.device) -> Callable[[float], float]:
     slope = max(0.0, (seconds[1] - seconds[0]) / (pixels[1] - pixels[0]))
 
     def speed(many: float) -> float:
-        reference = _SECONDS_PER_PIXEL * many + _SECONDS_PER_GAUSSIAN * _MIN_GAUSSIANS
+        reference = _SECONDS_PER_PIXEL * many + _SECONDS_PER_GAUSSIAN * _MIN_PLANNED_GAUSSIANS
         return reference / max(seconds[0] + slope * (many - pixels[0]), _MIN_CARD_SECONDS)
 
     return speed

@@ -38,9 +38,9 @@ MIN_ROOM_TAIL_RATIO = 6.0
 """Distance of the outermost thousandth from the middle over the median distance, from which on a capture is a
 room. Eight objects have 1.8 to 3.7, four scenes from within 23 to 50 (capture_kinds.json).
 """
-_MIN_SEEN_OPACITY = 0.3
+_MIN_ROOM_OPACITY = 0.3
 """Opacity from which on Gaussians count in these two."""
-_MIN_SEEN_GAUSSIANS = 100
+_MIN_ROOM_GAUSSIANS = 100
 """Gaussians below which neither says anything, so that the capture is an object."""
 
 # Where the photographs were taken.
@@ -210,8 +210,8 @@ def is_room(gaussians: Gaussians) -> bool:
     """True for a capture that was made from within: what lies far out is coarser than the rest, or reaches
     far beyond it.
     """
-    seen = gaussians.opacities > _MIN_SEEN_OPACITY
-    if int(seen.sum()) < _MIN_SEEN_GAUSSIANS:
+    seen = gaussians.opacities > _MIN_ROOM_OPACITY
+    if int(seen.sum()) < _MIN_ROOM_GAUSSIANS:
         return False
     means = gaussians.means[seen]
     size = gaussians.log_scales[seen].topk(2, dim=1).values.mean(1)

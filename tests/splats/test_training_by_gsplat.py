@@ -99,7 +99,7 @@ def test_compiling_kernels_takes_no_minute(
         return rasterization(*args, **flags)
 
     monkeypatch.setattr(time, "perf_counter", lambda: real() + passed[0])
-    monkeypatch.setattr(plan, "_MIN_GAUSSIANS", 50)
+    monkeypatch.setattr(plan, "_MIN_PLANNED_GAUSSIANS", 50)
     monkeypatch.setattr(plan, "_TIMED_SIZES", ((16, 12), (24, 20)))
     run = tmp_path / "run"
     flags = ["--initial", "100", "--cap", "120", "--steps", "5", "--minutes", "1", "--output", str(run)]
@@ -139,7 +139,7 @@ def test_auto_trains_where_gsplat_draws(
     words = ["train", "fprf-splats", "--data", str(config.data), *flags, "--output", str(tmp_path / "run")]
     with pretend_cuda(), stand_in(), monkeypatch.context() as patched:
         # Steps by which the plan measures the device; the stand-in draws all Gaussians in all pixels.
-        patched.setattr(plan, "_MIN_GAUSSIANS", 50)
+        patched.setattr(plan, "_MIN_PLANNED_GAUSSIANS", 50)
         patched.setattr(plan, "_TIMED_SIZES", ((16, 12), (24, 20)))
         if not installed:
             patched.setitem(sys.modules, "gsplat", None)
