@@ -109,7 +109,7 @@ FLOWS = {
                     "view",
                 ),
                 Step(
-                    "splats.learner:GaussianLearner._target",
+                    "splats.view_corrections:ViewCorrections.moved",
                     "the photograph, its camera where it is now",
                     "H W pixels, axes, centre",
                 ),
@@ -120,9 +120,14 @@ FLOWS = {
                     "new rows [N R], errors",
                 ),
                 Step(
-                    "splats.learner:GaussianLearner._correct_view",
-                    "exposure and pose of this photograph",
-                    "tones, poses",
+                    "splats.view_corrections:ViewCorrections.learn_tones",
+                    "exposure and white balance of this photograph",
+                    "tones",
+                ),
+                Step(
+                    "splats.view_corrections:ViewCorrections.learn_poses",
+                    "where its camera stood, where asked for",
+                    "poses",
                 ),
                 Step(
                     "splats.learner:GaussianLearner._relocate_and_grow",
@@ -193,7 +198,7 @@ FLOWS = {
                 Step("page/web/live.js:tell", "a message of JSON over the WebSocket", "{type: look, ...}"),
                 Step("page.messages:read_message", "checks and decodes it", "a message, typed"),
                 Step("page.session:Session.handle", "decides what it asks for", "a change of the state"),
-                Step("page.state:State.changed", "a pure function: the new state", "State"),
+                Step("page.state:SharedState.changed", "a pure function: the new state", "SharedState"),
                 Step("page.session:Session._refresh", "what is seen is another", "a job for each client"),
                 Step(
                     "page.render_worker:RenderWorker.run",

@@ -13,7 +13,7 @@ from fprf.training.driver import learn, schedule_of
 def test_a_step_of_gaussians_goes_as_it_is_drawn(
     config: GaussiansConfig, scene: ParsedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learning, "_SETTLE", 0)
+    monkeypatch.setattr(learning, "_MIN_RELOCATION_STEP", 0)
     asked = replace(config, steps=25)
     learner = build(asked, scene)
     steps = lane("training-step", 1)
