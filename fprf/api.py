@@ -118,7 +118,9 @@ class TrainedScene:
     @property
     def references(self) -> tuple[str, ...]:
         """Names of the references of the style; those of a mix one after the other."""
-        return () if self.styled is None else self.styled.codes.names
+        if self.styled is None:
+            return ()
+        return self.styled.codes.names
 
     def camera(self, view: int | str) -> Cameras:
         """One captured camera, by number or name. Raises UsageError where there is none."""
@@ -286,13 +288,17 @@ class TrainedScene:
         reads = [self.trained.run.root, *self.style_files]
         if self.styled is not None:
             style = self.styled.controls.saved.style
-            reads += [path for path in (*style.references, *style.masks) if path != NO_MASK]
+            for path in (*style.references, *style.masks):
+                if path != NO_MASK:
+                    reads.append(path)
         return _origin(*reads)
 
     @property
     def restyle(self) -> Restyle | None:
         """The look that is rendered; None = as captured."""
-        return None if self.styled is None else self.styled.restyle
+        if self.styled is None:
+            return None
+        return self.styled.restyle
 
     def _local(self, cameras: Cameras) -> Cameras:
         """Cameras about the scene's origin."""
@@ -389,6 +395,8 @@ class FinishedCapture:
             harmonics = self.capture.gaussians.harmonics
         else:
             harmonics = self.harmonics
-        views = None if self.seen is None else self.seen().scene.views
+        views = None
+        if self.seen is not None:
+            views = self.seen().scene.views
         with origin.writing([file, offset_file(file)]):
             return write_capture(file, self.capture, harmonics, views).losses()

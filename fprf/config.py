@@ -104,7 +104,9 @@ class LossConfig:
         )
         for name in weights:
             at_least(f"loss.{name}", getattr(self, name), 0.0)
-        names = [name for name, _ in self.penalties]
+        names = []
+        for name, _ in self.penalties:
+            names.append(name)
         for name, weight in self.penalties:
             if name in ("variation", "proposal_variation"):
                 raise ConfigError(f"loss.penalties: {name} has a field of its own; set loss.{name}")
@@ -313,7 +315,10 @@ class TrainConfig(RunConfig):
         sizes = scene.cameras.size[scene.train]
         if not len(sizes):
             return replace(self, downscale=1)
-        pace = _CPU_PACE if device.type == "cpu" else _ACCELERATOR_PACE
+        if device.type == "cpu":
+            pace = _CPU_PACE
+        else:
+            pace = _ACCELERATOR_PACE
         rays = float(self.steps * self.datamanager.batch_rays())
         if self.minutes is not None:
             rays = min(rays, 60 * self.minutes * pace.rays)

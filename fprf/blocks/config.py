@@ -30,7 +30,9 @@ class LayoutConfig(PluginConfig):
 
     @classmethod
     def of_number(cls, number: int) -> LayoutConfig:
-        return SingleConfig() if number == 1 else BisectConfig(count=number)
+        if number == 1:
+            return SingleConfig()
+        return BisectConfig(count=number)
 
     def build(self) -> BlockLayout:
         """The layout."""

@@ -160,7 +160,9 @@ class BlockedSemantic(SemanticField):
 
     def penalties(self) -> dict[str, Tensor]:
         """Penalties of the members in memory, added up."""
-        parts = [member.semantic for member in self.members.held]
+        parts = []
+        for member in self.members.held:
+            parts.append(member.semantic)
         return add_penalties(part.penalties() for part in parts if part is not None)
 
 
@@ -266,7 +268,10 @@ def inherit(member: Member, around: Member) -> None:
             for parameter in module.parameters():
                 known.add(id(parameter))
         planes = any(isinstance(module, Planes) for module in modules)
-        others = [parameter for parameter in own.parameters() if id(parameter) not in known]
+        others = []
+        for parameter in own.parameters():
+            if id(parameter) not in known:
+                others.append(parameter)
         if not planes or any(parameter.ndim != 1 for parameter in others):
             continue
         # Networks are copied, planes are resampled where the block lies.

@@ -217,7 +217,10 @@ class Plan:
     @property
     def rays(self) -> Annotated[Tensor, "Z"]:
         """int64 training pixels of each block."""
-        return torch.stack([(self.seen[:, z] * self.pixels).sum() for z in range(len(self.cells))])
+        parts = []
+        for z in range(len(self.cells)):
+            parts.append((self.seen[:, z] * self.pixels).sum())
+        return torch.stack(parts)
 
     def views_of(self, block: int) -> Annotated[Tensor, "M"]:
         """int64 training views that a block learns from."""
@@ -321,9 +324,15 @@ def read_cells(file: Path) -> list[Cell]:
 
 def _finite(corner: Annotated[Tensor, "3"]) -> list[float | None]:
     """Numbers of a corner; None for infinite ones, which JSON does not know."""
-    return [x if math.isfinite(x) else None for x in corner.tolist()]
+    found: list[float | None] = []
+    for x in corner.tolist():
+        found.append(x if math.isfinite(x) else None)
+    return found
 
 
 def _corner(values: object, infinite: float) -> Annotated[Tensor, "3"]:
     numbers = from_json(values, tuple[float | None, float | None, float | None], path="cells")
-    return torch.tensor([infinite if value is None else value for value in numbers], dtype=torch.float64)
+    parts = []
+    for value in numbers:
+        parts.append(infinite if value is None else value)
+    return torch.tensor(parts, dtype=torch.float64)

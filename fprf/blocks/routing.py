@@ -53,7 +53,10 @@ def shares(points: Annotated[Tensor, "N 3"], cells: Sequence[Cell]) -> Annotated
     """Weight of each block at every point, the surroundings last; rows are at least 0 and sum to 1."""
     if not cells:
         return points.new_ones(len(points), 1)
-    windows = torch.stack([window(points, cell) for cell in cells], -1)
+    parts = []
+    for cell in cells:
+        parts.append(window(points, cell))
+    windows = torch.stack(parts, -1)
     total = windows.sum(-1, keepdim=True)
     return torch.cat([windows / total.clamp_min(1), (1 - total).clamp_min(0)], -1)
 
@@ -109,8 +112,14 @@ def chart_of(cell: Cell) -> Chart:
 
 def surroundings_of(cells: Sequence[Cell]) -> Chart:
     """The chart of what no block holds: contracted around the bounds of all cells."""
-    low = torch.stack([cell.low for cell in cells])
-    high = torch.stack([cell.high for cell in cells])
+    parts = []
+    for cell in cells:
+        parts.append(cell.low)
+    low = torch.stack(parts)
+    parts = []
+    for cell in cells:
+        parts.append(cell.high)
+    high = torch.stack(parts)
     return Chart(low.amin(0), high.amax(0), contracted=True)
 
 
@@ -149,7 +158,11 @@ class InsetRouter:
             every = torch.arange(len(points), device=points.device)
             return [Group((0, 1), every, torch.stack([inside, ~inside], -1).to(points.dtype))]
         parts = (Group((0,), inside.nonzero()[:, 0], None), Group((1,), (~inside).nonzero()[:, 0], None))
-        return [part for part in parts if len(part.at)]
+        found: list[Group] = []
+        for part in parts:
+            if len(part.at):
+                found.append(part)
+        return found
 
 
 class BlendRouter:
@@ -157,9 +170,17 @@ class BlendRouter:
 
     def __init__(self, cells: Sequence[Cell]) -> None:
         self.cells = cells
-        charts = [chart_of(cell) for cell in cells]
-        low = torch.stack([chart.low for chart in charts]).amin(0)[:2]
-        high = torch.stack([chart.high for chart in charts]).amax(0)[:2]
+        charts = []
+        for cell in cells:
+            charts.append(chart_of(cell))
+        parts = []
+        for chart in charts:
+            parts.append(chart.low)
+        low = torch.stack(parts).amin(0)[:2]
+        parts = []
+        for chart in charts:
+            parts.append(chart.high)
+        high = torch.stack(parts).amax(0)[:2]
         self.low = low
         self.step = float((high - low).amax()) / TABLE
         counts = ((high - low) / self.step).ceil().long().clamp_min(1)

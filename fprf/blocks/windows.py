@@ -120,17 +120,28 @@ def _widened(cells: Sequence[Cell], scene: ParsedScene) -> list[Cell]:
     """The cells with the outermost windows of each photograph up to its edges: few points lie there, but it
     shows.
     """
-    widened: list[dict[int, Window]] = [{} for _ in cells]
+    widened: list[dict[int, Window]] = []
+    for _ in cells:
+        widened.append({})
     for view in sorted(set().union(*(cell.windows for cell in cells))):
-        own = [k for k, cell in enumerate(cells) if view in cell.windows]
-        window = np.array([cells[k].windows[view] for k in own])
+        own = []
+        for k, cell in enumerate(cells):
+            if view in cell.windows:
+                own.append(k)
+        parts = []
+        for k in own:
+            parts.append(cells[k].windows[view])
+        window = np.array(parts)
         lows = window[:, :2]
         highs = window[:, :2] + window[:, 2:]
         lows = np.where(lows == lows.min(0), 0, lows)
         highs = np.where(highs == highs.max(0), scene.cameras.size[view].numpy(), highs)
         for k, (left, top), (wide, tall) in zip(own, lows.tolist(), (highs - lows).tolist(), strict=True):
             widened[k][view] = (left, top, wide, tall)
-    return [replace(cell, windows=windows) for cell, windows in zip(cells, widened, strict=True)]
+    found: list[Cell] = []
+    for cell, windows in zip(cells, widened, strict=True):
+        found.append(replace(cell, windows=windows))
+    return found
 
 
 def _interval(first: float, last: float, size: int) -> tuple[int, int]:

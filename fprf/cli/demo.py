@@ -72,7 +72,9 @@ def run(args: list[str]) -> int:
 
     garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
-    captures = {name: config.output / f"{name.replace(' ', '-')}.ply" for name in (*LOOKS, ALL_TOGETHER)}
+    captures = {}
+    for name in (*LOOKS, ALL_TOGETHER):
+        captures[name] = config.output / f"{name.replace(' ', '-')}.ply"
     page = config.output / "garden.html"
     table = config.output / "metrics.json"
     origin = Origin(by="demo", overwrite=config.overwrite)

@@ -177,7 +177,10 @@ def machine() -> Iterator[Finding]:
     folder = user_folder("features")
     reason = refusal(folder)
     if reason:
-        where = "this user has no home" if cache_home() is None else f"{folder}: {reason}"
+        if cache_home() is None:
+            where = "this user has no home"
+        else:
+            where = f"{folder}: {reason}"
         found = f"{where}; every command compiles its kernels and encodes images again"
         remedy = (
             "export XDG_CACHE_HOME=FOLDER    # one that can be written to; NUMBA_CACHE_DIR for kernels alone"
@@ -271,7 +274,9 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     try:
         parser = recognise(data)
     except DataError:
-        photographs = find_photographs(data) if data.is_dir() else None
+        photographs = None
+        if data.is_dir():
+            photographs = find_photographs(data)
         if photographs is None or not photographs.files:
             raise
         yield from photographs_without_poses(data, photographs)
@@ -326,7 +331,10 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     for note in colour_notes(scene.paths):
         yield Finding("colours", note)
     if broken:
-        more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+        if len(broken) > 1:
+            more = f" and {len(broken) - 1} more"
+        else:
+            more = ""
         yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
     yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
@@ -344,7 +352,10 @@ def capture_file(path: Path) -> Iterator[Finding]:
     yield Finding("format", format_name(capture.path) or "")
     faults = gaussians.faults()
     said = ", ".join([f"{len(gaussians)}, harmonics of degree {gaussians.degree}", *faults])
-    remedy = "they are left out of what is drawn; export the capture again" if faults else ""
+    if faults:
+        remedy = "they are left out of what is drawn; export the capture again"
+    else:
+        remedy = ""
     yield Finding("gaussians", said, remedy, optional=True)
     up, reason = direction_up(capture)
     yield Finding("up", f"{axis_name(up)}: {reason}; --up says otherwise")
@@ -363,7 +374,10 @@ def photographs_without_poses(data: Path, photographs: "Photographs") -> Iterato
 
     files = photographs.files
     # Copies in another encoding are told where few are decoded; processing decodes all.
-    copies = equal_pictures(files) if len(files) <= _MAX_OPENED_VIEWS else equal_files(files)
+    if len(files) <= _MAX_OPENED_VIEWS:
+        copies = equal_pictures(files)
+    else:
+        copies = equal_files(files)
     yield Finding("format", "photographs without poses")
     yield Finding("images", f"{len(files) - len(copies)} photographs")
     notes = photographs.notes()
@@ -417,7 +431,10 @@ def video_file(path: Path) -> Iterator[Finding]:
         yield Finding("frames", "none can be decoded", remedy)
         return
     if whole:
-        remedy = "copy it from the camera again; what can be read is used" if log.missing else ""
+        if log.missing:
+            remedy = "copy it from the camera again; what can be read is used"
+        else:
+            remedy = ""
         yield Finding("frames", log.sentence(), remedy, optional=True)
     else:
         yield Finding(

@@ -169,7 +169,9 @@ def write_scalars(folder: Path, histories: "Sequence[History]", origin: Origin) 
             "--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'"
         ) from fault
     written = 0
-    places = [folder / (history.name or "training") for history in histories]
+    places = []
+    for history in histories:
+        places.append(folder / (history.name or "training"))
     for place in places:
         origin.check(place.glob(_EVENTS))
     for place, history in zip(places, histories, strict=True):

@@ -66,7 +66,10 @@ def run(args: list[str]) -> int:
     with contextlib.ExitStack() as stack:
         for look in looks:
             files = _files(what, look.name, last=look is looks[-1])
-            pictures = _pictures(config, what, opened.scene.names) if look is looks[-1] else []
+            if look is looks[-1]:
+                pictures = _pictures(config, what, opened.scene.names)
+            else:
+                pictures = []
             stack.enter_context(origins[look.name].writing([*files, *pictures]))
         display = stack.enter_context(Display())
         export = _Export(config, what, opened, looks, display)
@@ -100,7 +103,9 @@ def _styles(config: ExportConfig, what: Plan, file: StyleFile) -> list[tuple[str
     styles = named_styles(config.styles, file)
     if config.references:
         styles.insert(0, (tidy(style_name(config.style, config.references)) or "style", file))
-    names = [name.casefold() for name, _ in styles]
+    names = []
+    for name, _ in styles:
+        names.append(name.casefold())
     for name, _ in styles:
         if names.count(name.casefold()) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
@@ -134,7 +139,9 @@ def _files(what: Plan, look: str, *, last: bool) -> list[Path]:
     from ..rendering.local_frame import offset_file  # imports torch
 
     if what.single is not None:
-        return [what.single, offset_file(what.single)] if last else []
+        if last:
+            return [what.single, offset_file(what.single)]
+        return []
     files: list[Path] = []
     if what.formats:
         files += what.paths("splats", look, *(f".{each}" for each in what.formats))
@@ -142,7 +149,9 @@ def _files(what: Plan, look: str, *, last: bool) -> list[Path]:
         files += what.paths("mesh", look, ".ply", ".glb")
     if "cameras" in what.kinds and not look:
         files.append(what.folder / "transforms.json")
-    offsets = [offset_file(path) for path in files]
+    offsets = []
+    for path in files:
+        offsets.append(offset_file(path))
     return [*files, *offsets, *([] if look else [what.folder / "export.json"])]
 
 
@@ -150,7 +159,10 @@ def _pictures(config: ExportConfig, what: Plan, views: Sequence[str]) -> list[Pa
     """Pictures of views, which show the last look."""
     if not (config.images and "cameras" in what.kinds):
         return []
-    return [what.folder / f"images/{name}.png" for name in views]
+    found: list[Path] = []
+    for name in views:
+        found.append(what.folder / f"images/{name}.png")
+    return found
 
 
 def _looks(scene: "Scene", styles: Sequence[tuple[str, StyleFile]]) -> "list[_Look]":
@@ -257,7 +269,9 @@ class _Export:
             cap=self.config.fit_cap,
             background=self.opened.known.facts.background,
         )
-        looks = [look.restyle for look in self.looks]
+        looks = []
+        for look in self.looks:
+            looks.append(look.restyle)
         fitted = fit_gaussians(
             self.opened.scene, self.views, self.plain, looks, limits, report=self.display.count
         )
@@ -290,7 +304,9 @@ class _Export:
 
         known = self.opened.known
         scene = self.opened.scene.restyled(self.looks[-1].restyle)
-        files = [f"images/{name}.png" for name in scene.names]
+        files = []
+        for name in scene.names:
+            files.append(f"images/{name}.png")
         # Names are those of the captured views, so that a scene folder of renders can be compared with the
         # captured one.
         for view, file in enumerate(files if self.config.images else ()):

@@ -57,7 +57,10 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         GalleryConfig(), args, prog="fprf gallery", description=_GALLERY_HELP, positional=("run",)
     )
-    output = config.run / "gallery.html" if config.output is None else config.output
+    if config.output is None:
+        output = config.run / "gallery.html"
+    else:
+        output = config.output
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     origin = origin_of("gallery", config, file)
@@ -72,7 +75,10 @@ def run(args: list[str]) -> int:
     scene = opened.scene
     views = known.views(config.split, config.views)
     # Evenly from the split; views that are named are all shown.
-    most = len(views) if config.views else min(config.most, len(views))
+    if config.views:
+        most = len(views)
+    else:
+        most = min(config.most, len(views))
     views = [views[k * len(views) // most] for k in range(most)]
     chosen = _chosen(config, file)
     # Photographs have one name on the whole page, whichever styles they are in.
@@ -109,7 +115,9 @@ def _chosen(config: GalleryConfig, together: StyleFile) -> list[tuple[str, Style
     names = _called(config.references)
     # What names photographs one by one does not hold where each is alone.
     alone = replace(together.style, weights=(), masks=(), pin=(), forbid=())
-    chosen = [(name, StyleFile(replace(alone, references=(path,)))) for path, name in names.items()]
+    chosen = []
+    for path, name in names.items():
+        chosen.append((name, StyleFile(replace(alone, references=(path,)))))
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
@@ -160,7 +168,10 @@ def page_views(opened: "LoadedRun[Scene]", views: Sequence[int], display: Displa
     try:
         captured = read_scene(opened.run.load_config()[0])
         if tuple(view_names(captured.paths)) == known.names:
-            unseen = [view for view in views if view in known.test]
+            unseen = []
+            for view in views:
+                if view in known.test:
+                    unseen.append(view)
             photographs = dict(zip(unseen, load_images(captured, views=unseen), strict=True))
     except FprfError:
         pass
@@ -201,10 +212,15 @@ def page_styles(
         styled = apply_style(scene, file, encoders, encoded=encoded)
         seconds = time.perf_counter() - start
         look = scene.restyled(styled.restyle)
-        stills = [to_uint8(look.render(scene.cameras, view).rgb) for view in views]
+        stills = []
+        for view in views:
+            stills.append(to_uint8(look.render(scene.cameras, view).rgb))
         # Of a style on the way to another, the page names its own photographs alone.
         paths = dict(zip(labels(file.style.references), file.style.references, strict=True))
-        names = [label for label in styled.codes.names if label in paths]
+        names = []
+        for label in styled.codes.names:
+            if label in paths:
+                names.append(label)
         # Match maps say which photograph is where: there is something to say where there are several.
         rows = []
         maps = []
@@ -212,7 +228,9 @@ def page_styles(
             matched = match_map(scene, styled, view)
             maps.append(match_picture(matched, styled.codes))
             rows.append([row["share"] for row in summarize(matched, styled.codes)["references"]])
-        shares = [fmean(column) for column in zip(*rows, strict=True)]
+        shares = []
+        for column in zip(*rows, strict=True):
+            shares.append(fmean(column))
         style = Style(
             name,
             stills,

@@ -153,7 +153,10 @@ def spell_paths(args: Sequence[str], flags: dict[str, Flag], positional: Sequenc
             values = [arg]
             if current is not None and equals:
                 found = _paths(inline, current)
-                values = [f"{key}={found[0]}"] if len(found) == 1 else [key, *found]
+                if len(found) == 1:
+                    values = [f"{key}={found[0]}"]
+                else:
+                    values = [key, *found]
                 room = 0.0
             spelled += values
             continue

@@ -76,7 +76,10 @@ def run(args: list[str]) -> int:
     for row in rows():
         shown = "" if row.group == last else row.group
         last = row.group
-        state = "[red]broken[/]" if row in checked else "[green]ok[/]"
+        if row in checked:
+            state = "[red]broken[/]"
+        else:
+            state = "[green]ok[/]"
         cells = (shown, f"[cyan]{escape(row.name)}[/]", escape(row.value), escape(row.package))
         table.add_row(*cells, *([state] if config.check else []))
     console = Console()

@@ -61,7 +61,10 @@ def run(args: list[str]) -> int:
     )
     # A step that lost many images is one line, with an example.
     for step in ("choosing", "features", "matching", "mapping"):
-        dropped = [drop for drop in content["dropped"] if drop["step"] == step]
+        dropped = []
+        for drop in content["dropped"]:
+            if drop["step"] == step:
+                dropped.append(drop)
         for drop in dropped if len(dropped) <= _MAX_NAMED_IMAGES else dropped[:1]:
             if len(dropped) <= _MAX_NAMED_IMAGES:
                 count = ""
@@ -84,8 +87,14 @@ def _source(given: Path) -> Path:
 
     if not given.is_dir():
         return given
-    files = [path for path in sorted(given.iterdir()) if path.is_file() and not path.name.startswith(".")]
-    videos = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
+    files = []
+    for path in sorted(given.iterdir()):
+        if path.is_file() and not path.name.startswith("."):
+            files.append(path)
+    videos = []
+    for path in files:
+        if path.suffix.lower() in VIDEO_SUFFIXES:
+            videos.append(path)
     if not videos or any(path.suffix.lower() in IMAGE_SUFFIXES for path in given.rglob("*")):
         return given
     if len(videos) > 1:

@@ -124,7 +124,10 @@ def run(args: list[str]) -> int:
             print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
         with Display() as display:
             _render_frames(opened.scene, flight.cameras, paths, todo, takes, config, display)
-        made = _write_film(config.output, paths, flight.fps) if film else str(config.output)
+        if film:
+            made = _write_film(config.output, paths, flight.fps)
+        else:
+            made = str(config.output)
     seconds = time.perf_counter() - start
     print(f"{len(paths)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
     return 0
@@ -132,7 +135,10 @@ def run(args: list[str]) -> int:
 
 def _named(config: RenderVerbConfig) -> list[Path]:
     """Files that texts among the flags name: of further styles, and a camera path."""
-    named = [path for path in [as_path(config.path)] if path.is_file()]
+    named = []
+    for path in [as_path(config.path)]:
+        if path.is_file():
+            named.append(path)
     for text in config.styles:
         if text != "plain":
             named += named_files(text.partition("=")[2])
@@ -157,7 +163,10 @@ def _flight(opened: "LoadedRun[Scene]", config: RenderVerbConfig) -> _Flight:
 
     known = opened.known
     # Spirals, orbits and camera paths bring frames of their own.
-    views = known.views(config.split) if config.path in ("interpolate", "dataset") else []
+    if config.path in ("interpolate", "dataset"):
+        views = known.views(config.split)
+    else:
+        views = []
     cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
     if config.fps is not None:
         fps = config.fps
@@ -167,9 +176,13 @@ def _flight(opened: "LoadedRun[Scene]", config: RenderVerbConfig) -> _Flight:
         fps = read_camera_path(as_path(config.path))[1]
     # Captured views keep the stem of their image.
     if config.path == "dataset":
-        names = [known.names[view] for view in views]
+        names = []
+        for view in views:
+            names.append(known.names[view])
     else:
-        names = [f"{i:05d}" for i in range(len(cameras))]
+        names = []
+        for i in range(len(cameras)):
+            names.append(f"{i:05d}")
     return _Flight(cameras, names, fps)
 
 
@@ -182,7 +195,10 @@ def _frame_paths(config: RenderVerbConfig, names: Sequence[str], *, film: bool) 
     if film:
         folder = config.output.with_name(f".{config.output.stem}.frames")
         ending = "png"
-    return [folder / f"{name}.{ending}" for name in names]
+    found: list[Path] = []
+    for name in names:
+        found.append(folder / f"{name}.{ending}")
+    return found
 
 
 def _render_frames(
@@ -203,9 +219,13 @@ def _render_frames(
     if "depth" in config.show and todo:
         # One range of depths for the whole film, from a few small frames: else colours would flicker.
         some = sorted({k * (len(cameras) - 1) // (_PROBES - 1) for k in range(_PROBES)})
-        probes = [scene.render(cameras, k, resolution=_PROBE_RESOLUTION) for k in some]
+        probes = []
+        for k in some:
+            probes.append(scene.render(cameras, k, resolution=_PROBE_RESOLUTION))
         limits = depth_limits([view.depth for view in probes], [view.opacity for view in probes])
-    numbers = {path: number for number, path in enumerate(paths)}
+    numbers = {}
+    for number, path in enumerate(paths):
+        numbers[path] = number
     for done, path in enumerate(todo):
         left = None
         if done:
@@ -245,14 +265,17 @@ def _panels(
 
     # No style moves anything: depth and normals are those of any look that is rendered already.
     if "colour" in config.show:
-        views = [take.scene(frame).render(cameras, frame) for take in takes]
+        views = []
+        for take in takes:
+            views.append(take.scene(frame).render(cameras, frame))
     else:
         views = []
     geometry = views[0] if views else scene.render(cameras, frame)
     shown: list[Picture] = []
     for channel in config.show:
         if channel == "colour":
-            shown += [to_uint8(view.rgb) for view in views]
+            for view in views:
+                shown.append(to_uint8(view.rgb))
         elif channel == "depth":
             shown.append(depth_image(geometry.depth, geometry.opacity, limits))
         elif channel == "normals":
@@ -267,9 +290,8 @@ def _panels(
             for take in takes:
                 if take.styled is not None:
                     styles.append(take.styled)
-            shown += [
-                match_picture(match_map(scene, styled, frame, cameras), styled.codes) for styled in styles
-            ]
+            for styled in styles:
+                shown.append(match_picture(match_map(scene, styled, frame, cameras), styled.codes))
     return shown
 
 
@@ -295,7 +317,8 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
     # Files count by their content: a photograph that has changed under its name makes other frames.
     named = [*config.references, *config.masks, config.style, config.between, config.keyframes]
     if config.keyframes is not None:
-        named += [key.style for key in read_keyframes(config.keyframes)]
+        for key in read_keyframes(config.keyframes):
+            named.append(key.style)
     for path in [*named, *_named(config)]:
         if path is not None and path.is_file():
             digest.update(path.read_bytes())

@@ -172,11 +172,17 @@ def _neighbours_gain(
     """Gains of colours that `--match-light` takes from captures that lie beside; None where it takes means."""
     from ..splats.capture_light import neighbouring_light
 
-    captures = [path for path in photographed if format_name(path) is not None]
+    captures = []
+    for path in photographed:
+        if format_name(path) is not None:
+            captures.append(path)
     if not config.match_light or not captures or len(captures) < len(photographed):
         return None
     gain = neighbouring_light(seen, photographed, activated=config.activated)
-    how = "by the means of all colours" if gain is None else "where the captures meet"
+    if gain is None:
+        how = "by the means of all colours"
+    else:
+        how = "where the captures meet"
     display.say(f"--match-light: {how}")
     return gain
 
@@ -217,7 +223,10 @@ def _write_captures(
     done = 0
     # Of a single capture that is not written the faults are told all the same.
     for number, path in enumerate(config.captures if files or len(config.captures) == 1 else ()):
-        capture = seen.first if number == 0 else read_capture(path, activated=config.activated)
+        if number == 0:
+            capture = seen.first
+        else:
+            capture = read_capture(path, activated=config.activated)
         faulty = False
         for one, out in zip(made, files[number] if files else (), strict=False):
             display.count(done, steps, "restyling")
@@ -225,7 +234,10 @@ def _write_captures(
             written = write_capture(out.capture, capture, harmonics, seen.scene.views)
             write_style(out.style, one.styled.controls.saved)
             faulty = written.faulty
-            where = f"{out.capture.name}: " if len(files) > 1 else ""
+            if len(files) > 1:
+                where = f"{out.capture.name}: "
+            else:
+                where = ""
             for loss in written.losses():
                 losses[f"{where}{loss}"] = None
             done += 1
@@ -266,9 +278,14 @@ def _report(
     from ..memory import peak
 
     seconds = written.seconds + sum(each.seconds for each in made)
-    missing = [f"{number} {what}" for what, number in written.left.items()]
+    missing = []
+    for what, number in written.left.items():
+        missing.append(f"{number} {what}")
     told = "".join(f", {each}" for each in (*missing, *written.losses))
-    files = f" in {len(config.captures)} files" if len(config.captures) > 1 else ""
+    if len(config.captures) > 1:
+        files = f" in {len(config.captures)} files"
+    else:
+        files = ""
     print(
         f"{seen.count} Gaussians{files}{told}; looked at in {looked:.1f} s, "
         f"{seconds / max(1, len(made)):.2f} s for each of {len(made)} styles, at most {(peak() or 0) / 1e9:.1f} GB"
@@ -443,7 +460,9 @@ def _written(
 def _explained(config: RestyleConfig, name: str) -> list[Path]:
     """The files of `--explain` in a style."""
     folder = _beside(config).parent / name
-    return [folder / "explain.json", folder / "explain.png"] if config.explain else []
+    if config.explain:
+        return [folder / "explain.json", folder / "explain.png"]
+    return []
 
 
 def _capture_files(file: _CaptureFile) -> list[Path]:
@@ -459,7 +478,10 @@ def _capture_files(file: _CaptureFile) -> list[Path]:
 def _with_views(config: RestyleConfig, file: StyleFile, origin: Origin) -> StyleFile:
     """The style with rendered views in the place of captures and runs among its references."""
     style = file.style
-    scenes = [path for path in style.references if is_scene(path)]
+    scenes = []
+    for path in style.references:
+        if is_scene(path):
+            scenes.append(path)
     if not scenes:
         return file
     if config.each:
@@ -532,7 +554,10 @@ def _names_of(stems: Iterable[str]) -> list[str]:
     counts = Counter(stem.casefold() for stem in stems)
     names: list[str] = []
     for number, stem in enumerate(stems):
-        name = stem if counts[stem.casefold()] == 1 else f"{stem}-{number}"
+        if counts[stem.casefold()] == 1:
+            name = stem
+        else:
+            name = f"{stem}-{number}"
         names.append(unused_name(name, names))
     return names
 
@@ -562,7 +587,9 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     most = min(_MAX_PAGE_VIEWS, nearer)
     views = sorted({round((k + 0.5) * nearer / most - 0.5) for k in range(most)})
     cameras = scene.cameras.scaled(0.5)
-    before = [to_uint8(scene.render(cameras, view).rgb) for view in views]
+    before = []
+    for view in views:
+        before.append(to_uint8(scene.render(cameras, view).rgb))
     after = [[to_uint8(each.scene.render(cameras, view).rgb) for view in views] for each in made]
     names = labels(config.references)
     styles = []

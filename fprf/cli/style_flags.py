@@ -65,14 +65,16 @@ def read_flags(
     default, args = slots.resolve(default, args)
     if type(default.stylizer) is not kind and hasattr(default.stylizer, "centred"):
         default = slots.replace(default, "stylizer.centred", centred)
-    flags = {f"--{name}": name for name in PRESETS}
+    flags = {}
+    for name in PRESETS:
+        flags[f"--{name}"] = name
     for flag in (arg for arg in args if arg in flags):
         print(f"{flag}: {preset_flags(flags[flag])}")
         default = with_preset(default, flags[flag])
     args = [arg for arg in args if arg not in flags]
-    meanings = [
-        f"{flag} stands for {preset_flags(name)}; other flags come over it." for flag, name in flags.items()
-    ]
+    meanings = []
+    for flag, name in flags.items():
+        meanings.append(f"{flag} stands for {preset_flags(name)}; other flags come over it.")
     about = "\n\n".join([description, *meanings])
     config = parse(default, _joined(args, default), prog=prog, description=about, positional=positional)
     config = with_folders(config, say)
@@ -80,7 +82,9 @@ def read_flags(
     file = file._replace(style=StyleConfig(**_styles(config)))
     # Who names photographs takes them as they are now, and masks likewise.
     if path is not None:
-        given = {arg.partition("=")[0] for arg in args}
+        given = set()
+        for arg in args:
+            given.add(arg.partition("=")[0])
         photographs = () if "--references" in given else config.references
         masks = () if "--masks" in given else config.masks
         check_photographs(path, file._replace(style=replace(file.style, references=photographs, masks=masks)))
@@ -136,7 +140,10 @@ def _style_flag(args: Sequence[str]) -> Path | None:
     path = None
     for at, arg in enumerate(args):
         key, equals, inline = arg.partition("=")
-        value = inline if equals else "".join(args[at + 1 : at + 2])
+        if equals:
+            value = inline
+        else:
+            value = "".join(args[at + 1 : at + 2])
         if key == "--style" and value and not value.startswith("-") and value != "none":
             (path,) = expanded([as_path(value)])[:1]
     return path

@@ -68,10 +68,15 @@ def run(args: list[str]) -> int:
     scene = opened.scene
     views = opened.known.views(config.split, config.views)
     names = _names(config, [scene.names[view] for view in views])
-    explained = ["explain.json", "explain.png"] if config.explain else []
+    if config.explain:
+        explained = ["explain.json", "explain.png"]
+    else:
+        explained = []
     origin = origin_of("stylize", config, file)
     output = _folder(config, origin, [*explained, *names])
-    tables = [output / name for name in explained]
+    tables = []
+    for name in explained:
+        tables.append(output / name)
     if config.explain and not config.references:  # regions alone: no style is built
         with origin.writing(tables):
             print_explained(output, Regions(scene, *scene.measured()), None)
@@ -87,7 +92,9 @@ def run(args: list[str]) -> int:
     for note in styled.controls.notes:
         print(note)
     saved = styled.controls.saved
-    files = [output / name for name in names]
+    files = []
+    for name in names:
+        files.append(output / name)
     with origin.writing(tables), origin.writing(files, style_key(saved)) as removed:
         if removed:
             print(f"{output}: {removed} files of the style that was there before are removed")
@@ -110,9 +117,13 @@ def _names(config: StylizeConfig, views: Sequence[str]) -> list[str]:
     elif config.explain:
         kinds = []
     else:
-        kinds = [".png", "-match.png"] if config.matches else [".png"]
+        if config.matches:
+            kinds = [".png", "-match.png"]
+        else:
+            kinds = [".png"]
     for view in views:
-        names += [f"{view}{kind}" for kind in kinds]
+        for kind in kinds:
+            names.append(f"{view}{kind}")
     return [*names, "dictionary.safetensors", "style.json"]
 
 

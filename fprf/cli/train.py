@@ -97,7 +97,10 @@ def _make_room(run: Path, reads: Sequence[Path], overwrite: bool) -> None:
     from ..training.locks import lock_folder
     from ..training.run import Run
 
-    there = [run / name for name in _RUN_FILES if (run / name).exists()]
+    there = []
+    for name in _RUN_FILES:
+        if (run / name).exists():
+            there.append(run / name)
     if not there or (Run(run).exists and not overwrite):
         return
     if not overwrite:

@@ -91,5 +91,8 @@ def fit_basis(samples: Annotated[Tensor, "N I"], dim: int) -> Basis:
     largest = vectors.abs().argmax(0, keepdim=True)
     vectors = vectors * vectors.gather(0, largest).sign()
     total = values.sum()
-    energy = float(values[:dim].sum() / total) if total > 0 else 1.0
+    if total > 0:
+        energy = float(values[:dim].sum() / total)
+    else:
+        energy = 1.0
     return Basis(mean.float(), vectors.float().contiguous(), energy)

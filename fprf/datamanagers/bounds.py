@@ -73,7 +73,9 @@ def find_space(scene: ParsedScene) -> Space:
     """
     kind = find_kind(scene)
     if kind != "box":
-        return _ndc(scene) if kind == "ndc" else _contraction(scene)
+        if kind == "ndc":
+            return _ndc(scene)
+        return _contraction(scene)
     position = scene.cameras.pose[:, :, 3]
     # The point that all cameras look at, or their middle where axes are parallel.
     centre, certain = focus(scene.cameras)

@@ -251,9 +251,10 @@ def _tiles(body: bytes, item: int) -> Sequence[int]:
         if kind != b"dimg" or source != item:
             continue
         rest = reference[number_bytes + 2 :]
-        return [
-            int.from_bytes(rest[at : at + number_bytes], "big") for at in range(0, len(rest), number_bytes)
-        ]
+        found = []
+        for at in range(0, len(rest), number_bytes):
+            found.append(int.from_bytes(rest[at : at + number_bytes], "big"))
+        return found
     return ()
 
 

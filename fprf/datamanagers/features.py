@@ -168,7 +168,10 @@ class FeatureStore:
             self.scale = 1.0
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
         # Kernels read the coefficients where they lie, in mapped files.
-        self._address = torch.tensor([coefs.data_ptr() for coefs in self._coefs])
+        rows = []
+        for coefs in self._coefs:
+            rows.append(coefs.data_ptr())
+        self._address = torch.tensor(rows)
         self._shape = torch.cat([torch.tensor([coefs.shape[:2] for coefs in self._coefs]), self._size], 1)
         self._packed: tuple[guided.Packed, Tensor] | None = None
 
@@ -176,7 +179,10 @@ class FeatureStore:
         """The same targets, with the coefficients on a device as well: `at` of tensors there computes
         there.
         """
-        shapes = torch.tensor([coefs.shape[:2] for coefs in self._coefs])
+        parts = []
+        for coefs in self._coefs:
+            parts.append(coefs.shape[:2])
+        shapes = torch.tensor(parts)
         ends = shapes.prod(1).cumsum(0)
         packed = torch.empty(int(ends[-1]), *self._coefs[0].shape[2:], dtype=torch.float16, device=device)
         # One after the other: together they would be in memory twice.
@@ -292,7 +298,9 @@ def extract(
 def _device(encoder: Encoder) -> torch.device:
     """Device of its parameters; the CPU where it has none."""
     weight = next(chain(encoder.parameters(), encoder.buffers()), None)
-    return torch.device("cpu") if weight is None else weight.device
+    if weight is None:
+        return torch.device("cpu")
+    return weight.device
 
 
 @torch.no_grad()

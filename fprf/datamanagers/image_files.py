@@ -201,7 +201,9 @@ def kind_of(head: bytes) -> str:
     for kind, (first, _) in _READERS.items():
         if re.match(first, head, re.DOTALL):
             # Of these only TIFF may be the beginning of a raw photograph.
-            return RAW if kind == "TIFF" and raw_kind(head, []) else kind
+            if kind == "TIFF" and raw_kind(head, []):
+                return RAW
+            return kind
     return RAW if raw_kind(head, []) else ""
 
 
@@ -232,16 +234,25 @@ def decode(path: Path, *, upright: bool, rounded: Rounding = np.rint, convert: b
         kind, image = open_image(file, path)
         _check_size(path, kind, image)
         with decoding(kind, path, 8 * image.width * image.height):
-            tag = _tag_of(kind, file, image) if convert else ColourTag()
+            if convert:
+                tag = _tag_of(kind, file, image)
+            else:
+                tag = ColourTag()
             if kind == "PNG":
                 image = _verified_png(file, path, image)
             deep = ";16" in str(image.tile)
-            stored = exif_orientation(image) if kind == "TIFF" else 1
+            if kind == "TIFF":
+                stored = exif_orientation(image)
+            else:
+                stored = 1
             image.load()
             turn = _UPRIGHT_TURNS.get(_left_to_turn(kind, image, stored, upright))
         pixels = _colours(path, file, image, deep, rounded)
         pixels, alpha = _split(pixels, image)
-        profile = b"" if tag.over_profile else image.info.get("icc_profile", b"")
+        if tag.over_profile:
+            profile = b""
+        else:
+            profile = image.info.get("icc_profile", b"")
         pixels, done = _by_profile(pixels, profile)
         if tag.changes and not done:
             pixels = _by_tag(pixels, tag, _levels(kind, file, image, tag))
@@ -311,7 +322,9 @@ def _left_to_turn(kind: str, image: ImageFile, stored: int, upright: bool) -> in
     """The orientation by which loaded pixels are still to be turned."""
     if kind == "TIFF":
         # Pillow has turned them: they are turned back.
-        return 1 if upright else _INVERSE_TURNS.get(stored, stored)
+        if upright:
+            return 1
+        return _INVERSE_TURNS.get(stored, stored)
     if kind == "AVIF" or (upright and kind != "HEIC"):
         return exif_orientation(image)
     return 1
@@ -342,7 +355,10 @@ def _split(pixels: PIL.Image.Image, image: ImageFile) -> Decoded:
         grey = pixels.mode in ("1", "L", "LA")
         pixels = pixels.convert("RGBA")
         alpha = pixels.getchannel("A")
-        pixels = pixels.getchannel("R") if grey else pixels.convert("RGB")
+        if grey:
+            pixels = pixels.getchannel("R")
+        else:
+            pixels = pixels.convert("RGB")
     if pixels.mode not in ("L", "RGB", "CMYK"):
         pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
     return Decoded(pixels, alpha)

@@ -157,7 +157,9 @@ def load_preview(path: Path, side: int) -> NDArray[np.uint8]:
     scale = min(1.0, side / max(colour.size))
     size = (max(1, round(colour.width * scale)), max(1, round(colour.height * scale)))
     if alpha is None or np.asarray(alpha).min() == 255:
-        return pixels if scale == 1 else np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+        if scale == 1:
+            return pixels
+        return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
     cover = np.asarray(alpha)
     check_opaque(path, float((cover >= _HALF_OPAQUE).mean()))
     # The mean colour of what is seen, by how much of it is.
@@ -225,7 +227,10 @@ def colour_notes(paths: Sequence[Path]) -> list[str]:
     lines = []
     for note, names in alike.items():
         if note:
-            count = "" if len(names) == 1 else f" and {len(names) - 1} more"
+            if len(names) == 1:
+                count = ""
+            else:
+                count = f" and {len(names) - 1} more"
             lines.append(f"{names[0]}{count}: {note}")
     return lines
 
@@ -276,7 +281,10 @@ def useless_masks(scene: "ParsedScene") -> str:
     # painted.
     first = None
     for path in scene.masks:
-        share = 1.0 if path is None else float(load_mask(path).mean())
+        if path is None:
+            share = 1.0
+        else:
+            share = float(load_mask(path).mean())
         first = share if first is None else first
         if share not in (0, 1) or share != first:  # masks that say something end the reading early
             return ""
@@ -330,8 +338,14 @@ def image_names(folder: Path) -> list[str]:
         raise DataError(
             f"{folder}: no image among {len(entries)} files; put PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF images there"
         )
-    twins = {path.name for path in raw_twins(Path(name) for name in names)}
-    return [name for name in names if name not in twins]
+    twins = set()
+    for path in raw_twins(Path(name) for name in names):
+        twins.add(path.name)
+    found: list[str] = []
+    for name in names:
+        if name not in twins:
+            found.append(name)
+    return found
 
 
 def raw_twins(paths: Iterable[Path]) -> list[Path]:
@@ -360,25 +374,37 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
     # Those of folders are tried; those that are named are taken as they are.
     listed: dict[Path, None] = {}
     for path in paths:
-        found = _readable(path, report) if path.is_dir() else [path]
+        if path.is_dir():
+            found = _readable(path, report)
+        else:
+            found = [path]
         listed |= dict.fromkeys(found)
     return list(listed)
 
 
 def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
     """The images of a folder that can be references."""
-    images = [folder / name for name in image_names(folder)]
+    images = []
+    for name in image_names(folder):
+        images.append(folder / name)
     # Decoding runs in threads.
     with ThreadPoolExecutor() as pool:
         faults = list(pool.map(_fault, images))
-    reasons = [reason for reason in faults if reason]
+    reasons = []
+    for reason in faults:
+        if reason:
+            reasons.append(reason)
     for reason in reasons:
         report(f"left out: {reason}")
     if len(reasons) == len(images):
         raise DataError(
             f"{folder}: none of its {len(images)} images can be read; the first one: {reasons[0]}"
         )
-    return [image for image, reason in zip(images, faults, strict=True) if not reason]
+    found: list[Path] = []
+    for image, reason in zip(images, faults, strict=True):
+        if not reason:
+            found.append(image)
+    return found
 
 
 def _fault(path: Path) -> str:

@@ -67,7 +67,10 @@ def match_masks(
             held = best[owner]
             if held is None or offer < held:
                 best[owner] = offer
-    return [None if each is None else each[3] for each in best]
+    found: list[int | None] = []
+    for each in best:
+        found.append(None if each is None else each[3])
+    return found
 
 
 class _Photographs:
@@ -108,8 +111,14 @@ class _Photographs:
         """Those that lie in a folder of the masks' folder: with or without that of the images, or with less
         where no two folders have the name.
         """
-        ends = [k for k in numbers if _ends_with(self.folders[k], folder)]
-        near = [k for k in ends if len(self.folders[k]) - len(folder) <= 1]
+        ends = []
+        for k in numbers:
+            if _ends_with(self.folders[k], folder):
+                ends.append(k)
+        near = []
+        for k in ends:
+            if len(self.folders[k]) - len(folder) <= 1:
+                near.append(k)
         for chosen in (near, ends):
             if len({self.folders[k] for k in chosen}) == 1:
                 return chosen
@@ -121,7 +130,9 @@ def _folder_of(path: Path) -> tuple[str, ...]:
 
 
 def _ends_with(folder: tuple[str, ...], end: tuple[str, ...]) -> bool:
-    return folder[len(folder) - len(end) :] == end if len(end) <= len(folder) else False
+    if len(end) <= len(folder):
+        return folder[len(folder) - len(end) :] == end
+    return False
 
 
 def mask_folders(folder: Path, kind: MaskKind = USED) -> list[Path]:
@@ -131,7 +142,10 @@ def mask_folders(folder: Path, kind: MaskKind = USED) -> list[Path]:
         plain = re.sub(r"[\s_\-]+", "", spelling(name))
         if kind.folders.fullmatch(plain) and (folder / name).is_dir():
             found.append((name != kind.folder, len(plain), name))
-    return [folder / name for _, _, name in sorted(found)]
+    result: list[Path] = []
+    for _, _, name in sorted(found):
+        result.append(folder / name)
+    return result
 
 
 def mask_files(folder: Path) -> list[Path]:
@@ -180,13 +194,19 @@ class _Search:
 
     def _take(self, folder: Path, files: Sequence[Path], members: Sequence[int], base: Path) -> list[Path]:
         """Take masks for photographs, whose paths count from `base`; the files that are left over."""
-        paths = [_relative(self.photographs[k], base) for k in members]
+        paths = []
+        for k in members:
+            paths.append(_relative(self.photographs[k], base))
         chosen = match_masks(paths, files, self.words)
         for k, number in zip(members, chosen, strict=True):
             if self.masks[k] is None and number is not None:
                 self.masks[k] = folder / files[number]
         taken = set(chosen)
-        return [folder / file for number, file in enumerate(files) if number not in taken]
+        found: list[Path] = []
+        for number, file in enumerate(files):
+            if number not in taken:
+                found.append(folder / file)
+        return found
 
     def found(self) -> FoundMasks:
         """The masks, and what does not fit in one line."""
@@ -194,13 +214,19 @@ class _Search:
         return FoundMasks(masks, self._notes())
 
     def _notes(self) -> list[str]:
-        bare = [path for path, mask in zip(self.photographs, self.masks, strict=True) if mask is None]
+        bare = []
+        for path, mask in zip(self.photographs, self.masks, strict=True):
+            if mask is None:
+                bare.append(path)
         if not (bare or self.unused) or not (self.folders or any(self.masks)):
             return []
         where = self.folders[0] if self.folders else bare[0].parent
         if len(bare) == len(self.photographs):
             image = bare[0]
-            like = f", like {self.unused[0].name}," if self.unused else ""
+            if self.unused:
+                like = f", like {self.unused[0].name},"
+            else:
+                like = ""
             return [
                 f"{where}: none of its {self.count} images{like} is a mask by its name, so nothing is masked; call that of "
                 f"{image.name} {image.name}.png, {image.stem}.png or {image.stem}_mask.png"
@@ -249,7 +275,9 @@ def _folders_about(
             if level == data or data in level.parents:
                 beside[level].append(k)
         within[path.parent].append(k)
-    inside = {path.parent for path in photographs}
+    inside = set()
+    for path in photographs:
+        inside.add(path.parent)
     given: set[Path] = set()
     # Beside the folders of the images first, then in those: images may lie in the scene's folder itself.
     for levels in (beside, within):

@@ -67,7 +67,10 @@ class Photographs(NamedTuple):
 
     def notes(self) -> list[str]:
         """A line for each kind."""
-        return [left_out_note(kind, names) for kind, names in self.left_out.items()]
+        found: list[str] = []
+        for kind, names in self.left_out.items():
+            found.append(left_out_note(kind, names))
+        return found
 
 
 def left_out_note(kind: str, names: Sequence[str]) -> str:
@@ -111,12 +114,18 @@ def _without(
     """The files that have no kind; the others are added to what is left out."""
     for path, kind in kinds.items():
         left_out[kind].append(shown_name(path.relative_to(folder)))
-    return [path for path in files if path not in kinds]
+    found: list[Path] = []
+    for path in files:
+        if path not in kinds:
+            found.append(path)
+    return found
 
 
 def _kind_of_path(path: PurePath) -> str:
     """What a file is by the names of its folders and by its own first letter; empty for a photograph."""
-    folders = [spelling(part) for part in path.parts[:-1]]
+    folders = []
+    for part in path.parts[:-1]:
+        folders.append(spelling(part))
     for name in folders:
         words = set(re.split(r"[\s_.\-\d]+", name)) - {""}
         if name in _FOLDERS_OF_OTHERS:
@@ -127,7 +136,9 @@ def _kind_of_path(path: PurePath) -> str:
             return _MAPS
         if name in _FOLDERS_OF_MODELS:
             return _RECONSTRUCTION
-    return HIDDEN if any(part.startswith(".") for part in path.parts) else ""
+    if any(part.startswith(".") for part in path.parts):
+        return HIDDEN
+    return ""
 
 
 def _companions(files: Sequence[Path]) -> dict[Path, str]:
@@ -145,21 +156,36 @@ def _companions(files: Sequence[Path]) -> dict[Path, str]:
                 bases |= set(without_words(stem, words))
             if bases & (there - set(own)):
                 found[path] = kind
-    photographs = [path for path in files if path not in found]
-    sizes = {path: _size_of(path) for path in photographs if found}
-    return {path: kind for path, kind in found.items() if kind == _MAPS or _is_smallest(path, sizes)}
+    photographs = []
+    for path in files:
+        if path not in found:
+            photographs.append(path)
+    sizes = {}
+    for path in photographs:
+        if found:
+            sizes[path] = _size_of(path)
+    result: dict[Path, str] = {}
+    for path, kind in found.items():
+        if kind == _MAPS or _is_smallest(path, sizes):
+            result[path] = kind
+    return result
 
 
 def _is_smallest(path: Path, sizes: Mapping[Path, tuple[int, int]]) -> bool:
     """True for a picture that is smaller than all photographs beside it, or cannot be read."""
-    beside = [max(size) for other, size in sizes.items() if other.parent == path.parent]
+    beside = []
+    for other, size in sizes.items():
+        if other.parent == path.parent:
+            beside.append(max(size))
     return max(_size_of(path)) < min(beside, default=0)
 
 
 def _size_of(path: Path) -> tuple[int, int]:
     """Width and height; 0 and 0 for what cannot be read."""
     header = _header(path)
-    return (0, 0) if header is None else (header.width, header.height)
+    if header is None:
+        return (0, 0)
+    return (header.width, header.height)
 
 
 def _header(path: Path) -> ImageHeader | None:
@@ -177,7 +203,10 @@ def _reduced(files: Sequence[Path]) -> dict[Path, str]:
     found: dict[Path, str] = {}
     for folder, members in folders.items():
         for other, theirs in folders.items():
-            pairs = [(path, theirs[stem]) for stem, path in members.items() if stem in theirs]
+            pairs = []
+            for stem, path in members.items():
+                if stem in theirs:
+                    pairs.append((path, theirs[stem]))
             if other != folder and len(pairs) == len(members) and _are_reduced(pairs):
                 found |= dict.fromkeys(members.values(), _REDUCED_COPIES)
                 break

@@ -40,7 +40,9 @@ def without_suffixes(name: str) -> Iterator[str]:
 
 def numbered(stem: str) -> str:
     """A spelled stem without a word that any camera or program writes first: frame_0012 is 0012."""
-    return _CAMERA_WORDS.sub("", stem, count=1) if _CAMERA_WORDS.match(stem) else stem
+    if _CAMERA_WORDS.match(stem):
+        return _CAMERA_WORDS.sub("", stem, count=1)
+    return stem
 
 
 def without_words(stem: str, words: str) -> Iterator[str]:

@@ -78,7 +78,9 @@ def raw_exif(file: IO[bytes]) -> PIL.Image.Exif:
     if not directories:
         return exif
     # TIFF/EP has them in the first directory, most makers in the EXIF directory that it names.
-    values = {tag: directories[0].get(tag) for tag in _LENS_TAGS}
+    values = {}
+    for tag in _LENS_TAGS:
+        values[tag] = directories[0].get(tag)
     for offset in _numbers(directories[0], IFD.Exif):
         inner = _directory_at(file, offset)
         values |= {tag: inner[tag] for tag in _LENS_TAGS if tag in inner}
@@ -132,7 +134,10 @@ def full_picture(directories: list[ImageFileDirectory_v2]) -> ImageFileDirectory
     """The largest picture of a TIFF file whose first one is a smaller copy; None where the first one counts."""
     if not directories or not _is_reduced(directories[0]):
         return None
-    whole = [each for each in directories if not _is_reduced(each) and _area(each)]
+    whole = []
+    for each in directories:
+        if not _is_reduced(each) and _area(each):
+            whole.append(each)
     return max(whole, key=_area, default=None)
 
 
@@ -211,4 +216,8 @@ def _numbers(directory: ImageFileDirectory_v2, tag: int) -> list[int]:
     value = directory.get(tag)
     if not isinstance(value, tuple):
         value = (value,)
-    return [each for each in value if isinstance(each, int)]
+    found: list[int] = []
+    for each in value:
+        if isinstance(each, int):
+            found.append(each)
+    return found

@@ -124,7 +124,10 @@ def ssim(
         # Windows stand at the pixels in their middle, without a rim.
         edge = window // 2
         about = where[edge : edge + windows.shape[2], edge : edge + windows.shape[3]]
-        windows = windows[..., about] if bool(about.any()) else windows
+        if bool(about.any()):
+            windows = windows[..., about]
+        else:
+            windows = windows
     # Rounding can carry an identical pair past 1.
     return max(-1.0, min(1.0, _finite("ssim", float(windows.mean()))))
 
@@ -149,7 +152,9 @@ def lpips(
     pair = torch.stack([a, b]).float().permute(0, 3, 1, 2)
     if min(pair.shape[2:]) < _MIN_LPIPS_SIDE_PIXELS:
         scale = _MIN_LPIPS_SIDE_PIXELS / min(pair.shape[2:])
-        size = [max(_MIN_LPIPS_SIDE_PIXELS, round(scale * n)) for n in pair.shape[2:]]
+        size = []
+        for n in pair.shape[2:]:
+            size.append(max(_MIN_LPIPS_SIDE_PIXELS, round(scale * n)))
         pair = F.interpolate(pair, size, mode="bilinear", align_corners=False)
     total = 0.0
     for layer, features in enumerate(_activations(weights, pair), start=1):
@@ -376,7 +381,10 @@ def judge(
         truth, where = known.photograph(captured, view, masks=masks)
         pixels += truth.shape[0] * truth.shape[1]
         row = image_metrics(render.rgb, truth, where)
-        row["used_share"] = 1.0 if where is None else float(where.double().mean())
+        if where is None:
+            row["used_share"] = 1.0
+        else:
+            row["used_share"] = float(where.double().mean())
         rows[known.names[view]] = row
         # Two renders are held at a time, whatever the number of views. What is left out has no depth there.
         if where is not None:

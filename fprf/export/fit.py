@@ -118,7 +118,10 @@ def fit_gaussians(
             learner = GaussianLearner(replace(config, coarse=0.0), levels, bounds, stage=colours)
             learner.start_from(before.gaussians())
             seconds = 60 * limits.minutes * _COLOURS_TIME_SHARE
-        what = "fitting Gaussians" if number == 0 else "fitting colours"
+        if number == 0:
+            what = "fitting Gaussians"
+        else:
+            what = "fitting colours"
 
         def show(event: Report, what: str = what) -> None:
             report(round(100 * event.share), 100, what)

@@ -197,9 +197,10 @@ def _lattice(
     origin = maps.cameras.pose[:, :, 3].mean(0)
     seen = []
     # The lattice is as fine as the pixels on the surface are; what is seen too coarsely stays out.
-    width = torch.cat(
-        [(depth / maps.cameras.focal[view].mean())[depth.isfinite()] for view, depth in enumerate(maps.depth)]
-    )
+    parts = []
+    for view, depth in enumerate(maps.depth):
+        parts.append((depth / maps.cameras.focal[view].mean())[depth.isfinite()])
+    width = torch.cat(parts)
     if not len(width):
         raise DataError(
             "export: no view sees a surface within reach; raise --reach, or train longer (see `fprf eval`)"

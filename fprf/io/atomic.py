@@ -20,7 +20,10 @@ def unwritable(path: Path, error: OSError, needed: int | None = None) -> WriteEr
     """Error for a system that refuses to write at `path`; `needed` are the bytes of the file, where they are
     known.
     """
-    reason = os.strerror(error.errno) if error.errno else str(error)
+    if error.errno:
+        reason = os.strerror(error.errno)
+    else:
+        reason = str(error)
     try:
         folder = next(p for p in (path.absolute(), *path.absolute().parents) if p.is_dir())
         free = f", {shutil.disk_usage(folder).free >> 10} KiB are free there"

@@ -34,7 +34,9 @@ def user_folder(name: str) -> Path:
     user has none.
     """
     home = cache_home()
-    return _NOWHERE / name if home is None else home / "fprf" / name
+    if home is None:
+        return _NOWHERE / name
+    return home / "fprf" / name
 
 
 def cache_folder(name: str) -> Path:

@@ -234,7 +234,9 @@ def contact_sheet(tiles: Sequence[Tile]) -> Picture:
     """The tiles in rows of four, in their order. Letters beyond ASCII are shown as '?'."""
     if not tiles:
         return np.full((_GAP_PIXELS, _GAP_PIXELS, 3), _PAPER, dtype=np.uint8)
-    drawn = [_tile(tile) for tile in tiles]
+    drawn = []
+    for tile in tiles:
+        drawn.append(_tile(tile))
     columns = min(_MAX_TILES_PER_ROW, len(drawn))
     height = max(len(each) for each in drawn)
     rows = math.ceil(len(drawn) / columns)

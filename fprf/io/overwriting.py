@@ -171,7 +171,9 @@ def same_file(first: Path, second: Path) -> bool:
 
 def unused_name(name: str, taken: Iterable[str]) -> str:
     """The name, with a number from 2 on behind it where it is taken; names that differ in case are one."""
-    known = {each.casefold() for each in taken}
+    known = set()
+    for each in taken:
+        known.add(each.casefold())
     if name.casefold() not in known:
         return name
     number = 2
@@ -212,8 +214,14 @@ def _read_record(folder: Path) -> dict[str, _Entry]:
     """The list of a folder; empty where there is none, or none that can be understood."""
     try:
         content = parse_json((folder / RECORD).read_text("utf-8"))
-        files = content["files"] if content["format"] == _RECORD_FORMAT else {}
-        return {name: dict(entry) for name, entry in files.items()}
+        if content["format"] == _RECORD_FORMAT:
+            files = content["files"]
+        else:
+            files = {}
+        found: dict[str, _Entry] = {}
+        for name, entry in files.items():
+            found[name] = dict(entry)
+        return found
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return {}
 

@@ -29,7 +29,10 @@ _SYSTEM = re.compile(r"os error (\d+)")
 
 def _plain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors as a reader maps them: contiguous, on the CPU."""
-    return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    found: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        found[name] = tensor.detach().cpu().contiguous()
+    return found
 
 
 def _checksum(tensor: Tensor) -> int:

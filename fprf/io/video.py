@@ -175,12 +175,18 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     try:
         content = parse_json(record.read_text("utf-8"))
         known = content.get("key")
-        old = [Path(name).name for name in content.get("frames", [])]
+        old = []
+        for name in content.get("frames", []):
+            old.append(Path(name).name)
     except (OSError, ValueError, AttributeError, TypeError):
         known = None
         old = []
     if known == key:
-        return [path for path in paths if not path.is_file()]
+        found: list[Path] = []
+        for path in paths:
+            if not path.is_file():
+                found.append(path)
+        return found
     try:
         for name in {*old, *(path.name for path in paths)} - {"", ".."}:  # which are folders
             (folder / name).unlink(missing_ok=True)

@@ -377,4 +377,6 @@ class _CvFrame(VideoFrame):
         if ratio is not None and self._turned:
             ratio = 1 / ratio
         size = square_size(width, height, _shape_of_pixels(self._log, ratio, width, height))
-        return picture if size == (width, height) else resized(picture, *size)
+        if size == (width, height):
+            return picture
+        return resized(picture, *size)

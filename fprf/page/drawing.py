@@ -175,7 +175,9 @@ class Restyler:
             shares = torch.zeros(len(styled.codes.names)).index_add_(
                 0, styled.codes.reference, attention.float()
             )
-            names = [photograph.name for photograph, _ in look.mix]
+            names = []
+            for photograph, _ in look.mix:
+                names.append(photograph.name)
             taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
         return RegionInfo(region, float(scene.share[region]), tuple(taken))
 

@@ -99,7 +99,9 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     log_scales = gaussians.log_scales.numpy().clip(-20, 20)
     # A chunk holds neighbours, so that its own ranges make steps small where Gaussians lie close together.
     filled = np.minimum(np.arange(-(-count // CHUNK) * CHUNK), count - 1).reshape(-1, CHUNK)
-    ranges = [(rows[filled].min(1), rows[filled].max(1)) for rows in (means, log_scales)]
+    ranges = []
+    for rows in (means, log_scales):
+        ranges.append((rows[filled].min(1), rows[filled].max(1)))
     chunk = np.arange(count) // CHUNK
     parts = []
     for rows, (low, high), most in zip((means, log_scales), ranges, (65535, 255), strict=True):
@@ -177,7 +179,10 @@ def _clustered(
 def _nearest(rows: Annotated[Tensor, "N D"], book: Annotated[Tensor, "E D"]) -> Annotated[Tensor, "N"]:
     """The nearest entry of each row."""
     half = book.square().sum(1) / 2
-    return torch.cat([(half - part @ book.T).argmin(1) for part in torch.split(rows, _COMPARED_ROWS)])
+    parts = []
+    for part in torch.split(rows, _COMPARED_ROWS):
+        parts.append((half - part @ book.T).argmin(1))
+    return torch.cat(parts)
 
 
 def fit_maps(
@@ -206,7 +211,10 @@ def fit_maps(
     for step in range(rounds + 1):
         # Assign each row to the map of the least error, then solve each map's normal equations over its rows.
         book = torch.cat([(maps @ maps.transpose(1, 2)).flatten(1), maps.flatten(1)], 1)
-        label = torch.cat([(part @ book.T).argmin(1) for part in torch.split(rows, _COMPARED_ROWS)])
+        parts = []
+        for part in torch.split(rows, _COMPARED_ROWS):
+            parts.append((part @ book.T).argmin(1))
+        label = torch.cat(parts)
         if step == rounds:
             break
         gram = torch.zeros(len(maps), 9).index_add_(0, label, grams).view(-1, 3, 3)

@@ -331,7 +331,10 @@ class Session:
         """A picture as one byte for its kind, and a JPEG."""
         import cv2
 
-        quality = _FINAL_JPEG_QUALITY if final else _PREVIEW_JPEG_QUALITY
+        if final:
+            quality = _FINAL_JPEG_QUALITY
+        else:
+            quality = _PREVIEW_JPEG_QUALITY
         done, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
         assert done
         self._post(client, kind, (b"\1" if kind == "captured" else b"\0") + data.tobytes())

@@ -334,7 +334,10 @@ class Start:
                 found.append((run, folder.name))
             if progress is not None and progress["share"] < 1:
                 found.append((scene if trained and not files.is_dir() else files, folder.name))
-        dated = [(path.stat().st_mtime, path, name) for path, name in found if path.is_dir()]
+        dated = []
+        for path, name in found:
+            if path.is_dir():
+                dated.append((path.stat().st_mtime, path, name))
         rows = []
         for date, path, name in sorted(dated, reverse=True)[:_MAX_RECENT_SCENES]:
             kind = "trained"

@@ -99,7 +99,10 @@ class Look:
         A region for which every photograph would be forbidden loses its rules instead.
         """
         # Rules of other regions stay.
-        mine = {rule for rule in self.rules if rule.region == region}
+        mine = set()
+        for rule in self.rules:
+            if rule.region == region:
+                mine.add(rule)
         rest = self.rules - mine
         if action is None:
             return replace(self, rules=rest)
@@ -226,7 +229,9 @@ class SharedState:
 
     def unused_name(self, name: str) -> str:
         """The name, with a number where a photograph of the shelf has it already."""
-        taken = {photograph.name for photograph in self.shelf}
+        taken = set()
+        for photograph in self.shelf:
+            taken.add(photograph.name)
         return (
             name
             if name not in taken

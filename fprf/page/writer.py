@@ -203,7 +203,9 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
         {*torch.linspace(0, len(cameras) - 1, min(_MAX_PAGE_CAMERAS, len(cameras))).round().long().tolist()}
     )
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
-    depths = [depth(view) for view in chosen]
+    depths = []
+    for view in chosen:
+        depths.append(depth(view))
     up = torch.nn.functional.normalize(upwards(cameras).double(), dim=0)
     # One may go beyond the outermost camera, and half as far again as what is looked at: then nothing is left
     # to see.
@@ -272,7 +274,9 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
         "stills": dict(zip(names, stills, strict=True)),
     }
     height, width = page.views[0].original.shape[:2]
-    known = {reference.name: reference for reference in page.references}
+    known = {}
+    for reference in page.references:
+        known[reference.name] = reference
     blocks = "\n".join(_style(style, page.views, known) for style in page.styles)
     # Sections below the stage; those without content are left out, of the navigation too.
     below = [
@@ -281,7 +285,10 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     ]
     facts = ((name, fact if isinstance(fact, str) else f"{fact:,}") for name, fact in page.facts.items())
     rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts)
-    present = [(name, part) for name, part in below if part]
+    present = []
+    for name, part in below:
+        if part:
+            present.append((name, part))
     body = []
     for name, part in present:
         body.append(f'<section id="{name.lower()}"><h2>{name}</h2>\n{part}\n</section>')
@@ -311,7 +318,10 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
 
 
 def _img(picture: Picture, side: int, alt: str) -> str:
-    small = picture if picture.shape[2] == 4 else shrink(picture, side)
+    if picture.shape[2] == 4:
+        small = picture
+    else:
+        small = shrink(picture, side)
     height, width = small.shape[:2]
     size = f'width="{width}" height="{height}"'
     return f'<img src="{data_uri(small)}" alt="{escape(alt)}" {size} decoding="async" loading="lazy">'

@@ -41,7 +41,9 @@ def stem_of(path: Path) -> str:
     name = format_name(path)
     if path.name.lower() in ("meta.json", name):
         return path.resolve().parent.name
-    return path.stem if name is None else path.name[: -len(name) - 1]
+    if name is None:
+        return path.stem
+    return path.name[: -len(name) - 1]
 
 
 def captures_in(folder: Path) -> list[Path]:

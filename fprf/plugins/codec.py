@@ -96,7 +96,9 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         else:
             tag = {}
         hints = hints_of(type(value))
-        names = [f.name for f in dataclasses.fields(value)]
+        names = []
+        for f in dataclasses.fields(value):
+            names.append(f.name)
         if kind and "type" in names:
             raise ConfigError(
                 f"{path}: {type(value).__name__} has a field `type`, which names the plug-in; rename it"
@@ -129,7 +131,10 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
     if hint is Any:
         return data
     # Of a union the first kind that the value is of; where it is of none, what each of them expected is told.
-    choices = [h for h in members(hint) if h is not type(None)]
+    choices = []
+    for h in members(hint):
+        if h is not type(None):
+            choices.append(h)
     if data is None and len(choices) < len(members(hint)):
         return None
     if len(choices) > 1:
@@ -184,7 +189,9 @@ def _read(data: Any, hint: Any, path: str, packages: Mapping[str, str]) -> Any:
         if origin is Literal:
             allowed = {value: value for value in args}
         else:
-            allowed = {each.value: each for each in hint}
+            allowed = {}
+            for each in hint:
+                allowed[each.value] = each
         for value, meant in allowed.items():
             if type(value) is type(data) and value == data:  # True == 1
                 return meant
@@ -226,7 +233,10 @@ def _shown(text: str) -> str:
 def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[str, str]) -> Any:
     """A dataclass of the fields in an object."""
     hints = hints_of(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    fields = {}
+    for f in dataclasses.fields(cls):
+        if f.init:
+            fields[f.name] = f
     names = list(fields)
     for name, field in fields.items():
         if name not in data and field.default is field.default_factory is dataclasses.MISSING:
@@ -237,7 +247,9 @@ def _read_fields(data: dict[str, Any], cls: type, path: str, packages: Mapping[s
                 f"{path}: {cls.__name__} has no field {_shown(repr(key))}{registry.nearest(key, names)} "
                 f"(its fields: {', '.join(names) or 'none'})"
             )
-    values = {key: _read(value, hints[key], f"{path}.{key}", packages) for key, value in data.items()}
+    values = {}
+    for key, value in data.items():
+        values[key] = _read(value, hints[key], f"{path}.{key}", packages)
     try:
         return cls(**values)
     except (ConfigError, TypeError) as fault:  # out of its range

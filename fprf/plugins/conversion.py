@@ -35,14 +35,20 @@ def _converted(value: Any, hint: Any, name: str) -> Any:
         return None
     if is_dataclass(value) and not isinstance(value, type):
         return _converted_config(value)
-    numbers = [kind for kind in (int, float) if kind in kinds]
+    numbers = []
+    for kind in (int, float):
+        if kind in kinds:
+            numbers.append(kind)
     if numbers and isinstance(value, Real) and not isinstance(value, bool):
         return _number(value, numbers)
     if Path in kinds:
         return _path(value, name)
     if str in kinds and isinstance(value, os.PathLike):
         return os.fspath(value)
-    rows = [kind for kind in kinds if get_origin(kind) is tuple]
+    rows = []
+    for kind in kinds:
+        if get_origin(kind) is tuple:
+            rows.append(kind)
     return _tuple(value, rows[0], name) if rows else value
 
 
@@ -74,7 +80,9 @@ def _path(value: Any, name: str) -> Path:
         path = as_path(value)
     except TypeError as error:
         raise ConfigError(f"{name}: {value!r} is no path; give a text or a pathlib.Path") from error
-    return value if isinstance(value, Path) and value == path else path
+    if isinstance(value, Path) and value == path:
+        return value
+    return path
 
 
 def _tuple(value: Any, hint: Any, name: str) -> Any:
@@ -88,7 +96,10 @@ def _tuple(value: Any, hint: Any, name: str) -> Any:
     if single and several:
         items = [items]
     if isinstance(items, str | os.PathLike) or not isinstance(items, Iterable):
-        wanted = "a tuple or list" if several else f"{len(args)} values"
+        if several:
+            wanted = "a tuple or list"
+        else:
+            wanted = f"{len(args)} values"
         raise ConfigError(f"{name}: {value!r}; {wanted} is needed")
     items = list(items)
     if not several and len(items) != len(args):

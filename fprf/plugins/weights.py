@@ -27,7 +27,10 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             halves = (torch.float16, torch.bfloat16)
             wide = {}
             for name, tensor in tensors.items():
-                wide[name] = tensor.float() if tensor.dtype in halves else tensor
+                if tensor.dtype in halves:
+                    wide[name] = tensor.float()
+                else:
+                    wide[name] = tensor
             return wide, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
         raise WeightsError(

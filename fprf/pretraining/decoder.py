@@ -102,7 +102,10 @@ def style_distance(
     styled: Sequence[Annotated[Tensor, "B 2C"]], wanted: Sequence[Annotated[Tensor, "B 2C"]]
 ) -> Annotated[Tensor, ""]:
     """The style loss: mean squared differences, in the filters' units, summed over the layers."""
-    return torch.stack([F.mse_loss(a, b) for a, b in zip(styled, wanted, strict=True)]).sum()
+    parts = []
+    for a, b in zip(styled, wanted, strict=True):
+        parts.append(F.mse_loss(a, b))
+    return torch.stack(parts).sum()
 
 
 class Crops(NamedTuple):
@@ -148,27 +151,39 @@ def prepare_crops(
     CPU.
     """
     # Crops of one size, small enough for every photograph.
-    loaded = [load_photo(path, longest).to(device) for path in photos]
+    loaded = []
+    for path in photos:
+        loaded.append(load_photo(path, longest).to(device))
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
     made = []
     for i, photo in enumerate(loaded):
         made.append(filtered_crop(encoder, photo, side, generator_of(seed, i)))
     # Units first: activations below are divided by them.
-    images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
+    images = []
+    for _, rgb in made:
+        images.append(rgb.view(side, side, 3).permute(2, 0, 1))
     if measure:
         network.measure(images)
     # The content's structure is its normalised activations: they take the deviation of any style later
     # (AdaIN).
-    seen = [network(image[None]) for image in images]
+    seen = []
+    for image in images:
+        seen.append(network(image[None]))
     structure = []
     for each in seen:
         mean, std = (half[:, :, None, None] for half in style_statistics([each[CONTENT]])[0].chunk(2, 1))
         structure.append(((each[CONTENT] - mean) / std).half())
-    statistics = [style_statistics(each) for each in seen]
+    statistics = []
+    for each in seen:
+        statistics.append(style_statistics(each))
     # Moments of features in float64; the features themselves are kept in half precision, since there are
     # many.
-    wide = [double(features) for features, _ in made]
-    own = [(each.mean(0), each.var(0, correction=0)) for each in wide]
+    wide = []
+    for features, _ in made:
+        wide.append(double(features))
+    own = []
+    for each in wide:
+        own.append((each.mean(0), each.var(0, correction=0)))
     return Crops(
         side,
         torch.stack([features.half() for features, _ in made]),
@@ -196,7 +211,9 @@ def restyling_losses(
     )
     colour = decode(features.flatten(0, 1)).view(len(content), crops.side, crops.side, 3)
     activations = network(colour.permute(0, 3, 1, 2))
-    wanted = [layer[style] for layer in crops.style]
+    wanted = []
+    for layer in crops.style:
+        wanted.append(layer[style])
     # L_c compares with AdaIN in VGG's own space, L_s with the style's moments layer by layer.
     mean, std = (half[:, :, None, None] for half in wanted[CONTENT].chunk(2, 1))
     structure = F.mse_loss(activations[CONTENT], crops.structure[content].float() * std + mean)

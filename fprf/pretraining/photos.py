@@ -38,7 +38,9 @@ def find_photos(folders: Sequence[Path]) -> list[Path]:
             )
     photos = []
     for folder in folders:
-        photos += [path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+        for path in folder.rglob("*"):
+            if path.suffix.lower() in SUFFIXES:
+                photos.append(path)
     if len(photos) < 2:
         listed = ", ".join(str(folder) for folder in folders) or "no folder"
         raise DataError(
@@ -60,7 +62,9 @@ def load_photo(path: Path, longest: int | None = None) -> Annotated[Tensor, "H W
     if longest is None or side <= longest:
         return pixels
     # Area means: a smaller photograph must not alias.
-    size = [max(1, round(n * longest / side)) for n in pixels.shape[:2]]
+    size = []
+    for n in pixels.shape[:2]:
+        size.append(max(1, round(n * longest / side)))
     smaller = F.interpolate(pixels.permute(2, 0, 1)[None], size, mode="area")[0]
     return smaller.permute(1, 2, 0).contiguous()
 

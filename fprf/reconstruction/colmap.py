@@ -72,7 +72,9 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
     settings: list[Any] = [config.lens, config.cameras, config.features, config.side, config.seed]
     if state.masks:
         settings.append(state.masks)
-    hashes = {name: image["sha256"] for name, image in state.images.items()}
+    hashes = {}
+    for name, image in state.images.items():
+        hashes[name] = image["sha256"]
     # Images may be added to those of before; other settings, or an image that has changed, begin anew.
     before: Any = None
     with contextlib.suppress(OSError, ValueError):
@@ -112,7 +114,10 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     video = "frames" in state.done
     kind = config.matching
     if kind == "auto":
-        kind = "exhaustive" if len(names) <= _MAX_EXHAUSTIVE_IMAGES else "similar"
+        if len(names) <= _MAX_EXHAUSTIVE_IMAGES:
+            kind = "exhaustive"
+        else:
+            kind = "similar"
     key = step_key(state.done["features"], kind, config.overlap, config.neighbours)
     if state.done.get("matches") == key and place.database.is_file():
         return kind
@@ -333,10 +338,16 @@ def _run(
         for line in place.log.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.strip():
                 lines.append(line)
-        last = lines[-1].strip()[-_MAX_LAST_WORDS:] if lines else "nothing was said"
+        if lines:
+            last = lines[-1].strip()[-_MAX_LAST_WORDS:]
+        else:
+            last = "nothing was said"
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {last}; {place.log} has the rest")
     progress(total, total, what)
-    before = 0.0 if name in ("features", "matches") else state.seconds.get(name, 0.0)
+    if name in ("features", "matches"):
+        before = 0.0
+    else:
+        before = state.seconds.get(name, 0.0)
     state.seconds[name] = round(before + time.perf_counter() - start, 2)
 
 

@@ -73,7 +73,9 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> tuple[li
     # Windows of equal length, but for rounding, and the sharpest frame of each.
     windows = min(count, len(scores))
     if windows:
-        edges = [round(k * len(scores) / windows) for k in range(windows + 1)]
+        edges = []
+        for k in range(windows + 1):
+            edges.append(round(k * len(scores) / windows))
     else:
         edges = [0]
     best = [max(range(low, high), key=lambda i: (scores[i], -i)) for low, high in pairwise(edges)]
@@ -159,11 +161,15 @@ def read_encoder(path: Path) -> str:
         with path.open("rb") as file:
             image = open_image(file, path)[1]
             tables = sorted(getattr(image, "quantization", {}).items())
-            sampling = [layer[1:3] for layer in getattr(image, "layer", [])]
+            sampling = []
+            for layer in getattr(image, "layer", []):
+                sampling.append(layer[1:3])
             progressive = bool(image.info.get("progressive"))
     except Exception:  # whatever is wrong with it, it is not needed
         return ""
-    return step_key(tables, sampling, progressive) if tables else ""
+    if tables:
+        return step_key(tables, sampling, progressive)
+    return ""
 
 
 def _exif(path: Path) -> PIL.Image.Exif:
@@ -235,7 +241,9 @@ def lost_files(state: State) -> str:
     alike: dict[str, list[str]] = {}
     for name, reason in state.dropped.items():
         alike.setdefault(reason, []).append(name)
-    told = [f"{_some(names)} ({reason})" for reason, names in alike.items()]
+    told = []
+    for reason, names in alike.items():
+        told.append(f"{_some(names)} ({reason})")
     total = len(state.dropped) + len(state.images)
     return f"{len(state.dropped)} of {total} files could not be decoded: {_some(told)}"
 
@@ -333,7 +341,9 @@ def _from_folder(
             continue
         entries[name] = known
     progress(len(files), len(files), "reading images")
-    order = [shown_name(path.relative_to(source)) for path in found.files]
+    order = []
+    for path in found.files:
+        order.append(shown_name(path.relative_to(source)))
     state.dropped = {name: state.dropped[name] for name in order if name in state.dropped}
     if copies:
         found.left_out[COPIES] = copies

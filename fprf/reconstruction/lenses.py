@@ -90,7 +90,11 @@ def unsaid_lenses(images: Images) -> list[str]:
         if not focal and not focal_35:
             unsaid.append(name)
     count = Counter(labels[name] for name in unsaid)
-    return [name for name in unsaid if count[labels[name]] >= 2 * MIN_IMAGES_OF_LENS]
+    found: list[str] = []
+    for name in unsaid:
+        if count[labels[name]] >= 2 * MIN_IMAGES_OF_LENS:
+            found.append(name)
+    return found
 
 
 def unsaid_sentence(images: Images) -> str:
@@ -98,7 +102,9 @@ def unsaid_sentence(images: Images) -> str:
     unsaid = unsaid_lenses(images)
     if not unsaid:
         return ""
-    hints = [grouping.reason for grouping in hinted_groupings(images)]
+    hints = []
+    for grouping in hinted_groupings(images):
+        hints.append(grouping.reason)
     told = f"{len(unsaid)} of {len(images)} photographs say no focal length"
     if hints:
         return f"{told}, and their {' and '.join(hints)} hint at several cameras: residuals will tell"
@@ -181,7 +187,9 @@ def cluster_values(
     least = min(np.diff(centres))
     if least < max(MIN_SEPARATION * deviation, math.log(MIN_FOCAL_RATIO)):
         return None
-    between = [float(values[order[edge]] - values[order[edge - 1]]) for edge in edges[1:-1]]
+    between = []
+    for edge in edges[1:-1]:
+        between.append(float(values[order[edge]] - values[order[edge - 1]]))
     if min(between) < MIN_GAP_RATIO * max(gaps):
         return None
     return cluster

@@ -80,7 +80,9 @@ class State:
         # Only a folder that is new, or holds no more than images, is begun in.
         if not path.is_file():
             if place.root.is_dir():
-                here = [entry.name for entry in place.root.iterdir()]
+                here = []
+                for entry in place.root.iterdir():
+                    here.append(entry.name)
             else:
                 here = []
             if (place.root.exists() and not place.root.is_dir()) or set(here) - _NAMES_OF_NEW_FOLDERS:
@@ -169,7 +171,10 @@ def report(
     """
     images = state["images"]
     unused = state["dropped"]
-    main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
+    if models:
+        main = models[0]
+    else:
+        main = {"images": [], "points": 0, "error_pixels": None, "track_length": None}
     dropped = []
     for image, reason in unused.items():
         dropped.append({"image": image, "step": "choosing", "reason": reason})

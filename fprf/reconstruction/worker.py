@@ -65,7 +65,10 @@ def _features(pycolmap: Any, job: dict[str, Any]) -> int:
             images = {image.name: image for image in base.read_all_images()}
             for name in group:
                 image = images.get(name)
-                camera = camera if image is None else image.camera_id
+                if image is None:
+                    camera = camera
+                else:
+                    camera = image.camera_id
                 if image is None or not base.exists_keypoints(image.image_id):
                     missing.append(name)
         if not missing:
@@ -164,7 +167,9 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
 
 def _has_true_lenses(model: Any) -> bool:
     """True where all focal lengths could be those of lenses on one walk."""
-    focal = [camera.mean_focal_length() for camera in model.cameras.values()]
+    focal = []
+    for camera in model.cameras.values():
+        focal.append(camera.mean_focal_length())
     return bool(min(focal) > 0 and max(focal) < _MAX_LENS_RATIO * min(focal))
 
 
@@ -235,7 +240,9 @@ def _sampled_points(model: Any) -> list[int]:
     seen = dict.fromkeys(model.images, 0)
     chosen = []
     for number, point in sorted(model.points3D.items(), key=lambda item: -item[1].track.length()):
-        images = {element.image_id for element in point.track.elements}
+        images = set()
+        for element in point.track.elements:
+            images.add(element.image_id)
         if any(seen[image] < _POINTS_OF_IMAGE for image in images):
             chosen.append(number)
             for image in images:

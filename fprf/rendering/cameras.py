@@ -179,14 +179,18 @@ class PixelRays:
             -1,
         )
         kinds, self.kind = torch.unique(described, dim=0, return_inverse=True)
-        first = torch.stack([(self.kind == k).nonzero()[0, 0] for k in range(len(kinds))])
+        parts = []
+        for k in range(len(kinds)):
+            parts.append((self.kind == k).nonzero()[0, 0])
+        first = torch.stack(parts)
         area = cameras.size[first].prod(-1)
         self.start = area.cumsum(0) - area
         self.table: Tensor | None = None
         if int(area.sum()) * 24 <= limit:
-            self.table = torch.cat(
-                [directions_of(intrinsics_of(cameras, int(view)), cameras.pose.device) for view in first]
-            )
+            parts = []
+            for view in first:
+                parts.append(directions_of(intrinsics_of(cameras, int(view)), cameras.pose.device))
+            self.table = torch.cat(parts)
 
     @property
     def waits(self) -> bool:

@@ -37,7 +37,10 @@ def rotations(quaternion: Annotated[Tensor, "F 4"]) -> Annotated[Tensor, "F 3 3"
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    parts = []
+    for row in rows:
+        parts.append(torch.stack(row, -1))
+    return torch.stack(parts, -2)
 
 
 def slerp(

@@ -74,7 +74,9 @@ def blurred_views(cameras: Cameras, images: Mapping[int, Image], scales: int) ->
     place = pose[:, :, 3]
     ahead = -pose[:, :, 2]
     spread = float((place - place.mean(0)).norm(dim=1).mean()) or 1.0
-    blurred: list[set[int]] = [set() for _ in range(scales)]
+    blurred: list[set[int]] = []
+    for _ in range(scales):
+        blurred.append(set())
     for row, view in enumerate(views):
         apart = (place - place[row]).norm(dim=1) / spread + (ahead - ahead[row]).norm(dim=1)
         apart[row] = torch.inf

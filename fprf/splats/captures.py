@@ -209,10 +209,15 @@ def _load_findings(path: Path, count: int, say: Callable[[str], None]) -> _Findi
 
 def _save_findings(path: Path, found: _Findings) -> None:
     """Keep what was found out, and remove what was not asked for longest."""
-    views = {f"camera.{field.name}": getattr(found.cameras, field.name) for field in fields(Cameras)}
+    views = {}
+    for field in fields(Cameras):
+        views[f"camera.{field.name}"] = getattr(found.cameras, field.name)
     save_kept(path, {**views, **semantics_tensors(found.semantics)})
     with suppress(OSError):  # another process removes files, too: what is left the next one finds
-        files = [each for each in path.parent.glob("*.safetensors") if each.is_file()]
+        files = []
+        for each in path.parent.glob("*.safetensors"):
+            if each.is_file():
+                files.append(each)
         files.sort(key=lambda each: each.stat().st_mtime)
         for old in files[:-_MAX_CACHED_CAPTURES]:
             old.unlink(missing_ok=True)
@@ -274,10 +279,15 @@ def open_captures(
         return Captures(scene, whole, (torch.zeros(3),), first, len(first.gaussians))
     samples = []
     for path in paths:
-        capture = first if path == paths[0] else _read(path, look, say)
+        if path == paths[0]:
+            capture = first
+        else:
+            capture = _read(path, look, say)
         samples.append(_sample_of(capture, first.origin, max(1, sample // len(paths))))
         release(capture.data)
-    parts = [each.part for each in samples]
+    parts = []
+    for each in samples:
+        parts.append(each.part)
     moved = _apart(parts)
     joined = _joined(parts, moved)
     together = replace(
@@ -315,7 +325,10 @@ class _Sample(NamedTuple):
 
 def moved_origin(origin: Origin, new: Origin) -> Annotated[Tensor, "3"]:
     """What is added to positions about one origin to have them about a new one."""
-    return torch.tensor([old - other for old, other in zip(origin, new, strict=True)])
+    parts = []
+    for old, other in zip(origin, new, strict=True):
+        parts.append(old - other)
+    return torch.tensor(parts)
 
 
 def _sample_of(capture: Capture, origin: Origin, most: int) -> _Sample:
@@ -355,7 +368,10 @@ def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
         inner = part.means[torch.from_numpy(bulk_of(part.means.numpy()).apart <= 0.5)]
         boxes.append((inner.amin(0), inner.amax(0)))
     if not _overlap(boxes):
-        return [torch.zeros(3) for _ in parts]
+        found: list[Annotated[Tensor, "3"]] = []
+        for _ in parts:
+            found.append(torch.zeros(3))
+        return found
     moves = []
     at = 0.0
     for low, high in boxes:

@@ -450,7 +450,9 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
         if tones is not None:
             used = list(cell.windows)
             own = tones.going_on(tuple(sorted(set(range(len(gain))) - set(used))))
-            learnt = {name: saved.optimizer[f"tones.{name}.value"].clone() for name in ("gain", "exponent")}
+            learnt = {}
+            for name in ("gain", "exponent"):
+                learnt[name] = saved.optimizer[f"tones.{name}.value"].clone()
             own.load_state_dict(learnt)
             gain[used] += own.gains().detach()[used]
             count[used] += 1

@@ -53,7 +53,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = len(self.means)
-        k = self.harmonics.shape[1] if self.harmonics.ndim == 3 else 0
+        if self.harmonics.ndim == 3:
+            k = self.harmonics.shape[1]
+        else:
+            k = 0
         wanted = {
             "means": (n, 3),
             "quaternions": (n, 4),
@@ -100,7 +103,10 @@ class Gaussians:
     @property
     def tensors(self) -> dict[str, Tensor]:
         """All parameters by their names."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        found: dict[str, Tensor] = {}
+        for field in fields(self):
+            found[field.name] = getattr(self, field.name)
+        return found
 
     @property
     def finite(self) -> Annotated[Tensor, "N"]:
@@ -118,7 +124,9 @@ class Gaussians:
         parts = (self.means, self.quaternions, self.harmonics.flatten(1))
         bounded = (self.log_scales <= _MAX_LOG_SCALE).all(1) & ~self.logits.isnan()  # False for NaN
         for part in parts:
-            small = [(rows.abs() < _MAX_DRAWN_MAGNITUDE).all(1) for rows in torch.split(part, _CHECKED_ROWS)]
+            small = []
+            for rows in torch.split(part, _CHECKED_ROWS):
+                small.append((rows.abs() < _MAX_DRAWN_MAGNITUDE).all(1))
             bounded = bounded & torch.cat(small)
         return bounded, (self.quaternions.abs() >= _MIN_QUATERNION).any(1)
 
@@ -188,7 +196,10 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of some, one after the other."""
     tensors = {}
     for field in fields(Gaussians):
-        tensors[field.name] = torch.cat([getattr(part, field.name) for part in parts])
+        rows = []
+        for part in parts:
+            rows.append(getattr(part, field.name))
+        tensors[field.name] = torch.cat(rows)
     return Gaussians(**tensors)
 
 

@@ -96,7 +96,10 @@ def find_ground(gaussians: Gaussians) -> Ground | None:
     # The axis whose slab holds most, if it holds much more than those across the other axes.
     axis = max((1, 2), key=lambda each: slabs[each].share)
     slab = slabs[axis]
-    across = [each for each in range(3) if each != axis]
+    across = []
+    for each in range(3):
+        if each != axis:
+            across.append(each)
     rival = max(slabs[each].share for each in across)
     flat = extents[axis] <= _MAX_HEIGHT_OF_Z * extents[across].min()
     if axis == 2 and not (flat and rival <= _MAX_RIVAL_OF_Z * slab.share):

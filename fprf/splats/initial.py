@@ -182,8 +182,12 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     # Pictures without their lenses: triangulation is that of pinholes.
     views = scene.train.tolist()
     detector = cv2.SIFT.create(nfeatures=_MAX_SIFT_FEATURES, contrastThreshold=_SIFT_CONTRAST)
-    cameras = {view: covering(scene.cameras, view, 1e-6) for view in views}
-    pictures = {view: undistorted(scene.cameras, view, images[view], cameras[view])[0] for view in views}
+    cameras = {}
+    for view in views:
+        cameras[view] = covering(scene.cameras, view, 1e-6)
+    pictures = {}
+    for view in views:
+        pictures[view] = undistorted(scene.cameras, view, images[view], cameras[view])[0]
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}
     for view in views:
@@ -192,13 +196,20 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
         )
         if described is None or len(keypoints) < 2:
             continue
-        places[view] = np.array([each.pt for each in keypoints], np.float64) + 0.5
+        parts = []
+        for each in keypoints:
+            parts.append(each.pt)
+        places[view] = np.array(parts, np.float64) + 0.5
         features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(
             np.float32
         )  # RootSIFT
     # Each view is matched with the few that stand near and look the same way.
-    centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
-    axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
+    centre = {}
+    for v in views:
+        centre[v] = scene.cameras.pose[v][:, 3].numpy()
+    axis = {}
+    for v in views:
+        axis[v] = -scene.cameras.pose[v][:, 2].numpy()
     middle = np.mean([*centre.values()], axis=0)
     spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), _SMALLEST_DIVISOR)
     positions = [np.zeros((0, 3))]
@@ -285,7 +296,10 @@ def _scattered(
     spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), _SMALLEST_DIVISOR)
     size = scene.cameras.size[views].numpy()
     pixel = rng.random((count, 2)) * size
-    colour = np.stack([images[v][int(y), int(x)] for v, (x, y) in zip(views, pixel, strict=True)])
+    parts = []
+    for v, (x, y) in zip(views, pixel, strict=True):
+        parts.append(images[v][int(y), int(x)])
+    colour = np.stack(parts)
     # Points at random depths on their rays, lenses left out: from OpenGL's camera axes into the world.
     depth = spread * np.exp(rng.uniform(math.log(1 / 3), math.log(30), count))
     plane = (pixel - scene.cameras.centre[views].numpy()) / scene.cameras.focal[views].numpy()

@@ -311,7 +311,10 @@ class GaussianLearner(SceneLearner):
     def _learning_rates(self, share: float) -> Annotated[Floats, "R"]:
         """Learning rates of the columns, when a share of the training is over; 0 of what is not learnt."""
         sizes = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "sh0": 3, "shN": 3 * (self.bands - 1)}
-        rates = np.concatenate([np.full(size, _LEARNING_RATES[name]) for name, size in sizes.items()])
+        parts = []
+        for name, size in sizes.items():
+            parts.append(np.full(size, _LEARNING_RATES[name]))
+        rates = np.concatenate(parts)
         rates[MEANS] *= self.bounds.scene_scale
         falls = np.full(len(rates), _FINAL_RATE_SHARE**share)
         falls[MEANS] = _FINAL_MEANS_RATE_SHARE**share
@@ -398,11 +401,16 @@ class GaussianLearner(SceneLearner):
     def begin(self, run: Run) -> str:
         assert self.source is not None  # learners of a run have it
         tones = "" if self.corrections.tones is None else ", tones"
-        where = "" if self.device == CPU else f", on {self.device} by gsplat"
+        if self.device == CPU:
+            where = ""
+        else:
+            where = f", on {self.device} by gsplat"
         line = f", {self.model.count} Gaussians at {self.source.points}{tones}{where}"
         blurred = sorted(self.levels[0].blurred)
         if blurred:
-            names = [Path(self.source.known.names[view]).name for view in blurred[:_MAX_NAMED_PHOTOGRAPHS]]
+            names = []
+            for view in blurred[:_MAX_NAMED_PHOTOGRAPHS]:
+                names.append(Path(self.source.known.names[view]).name)
             if len(blurred) > len(names):
                 names.append("...")
             line += f"; blurred, and so shown rarely: {len(blurred)} of {len(self.levels[0])}"
@@ -418,7 +426,9 @@ class GaussianLearner(SceneLearner):
 def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
     """The cameras of all views where training put them."""
     moves = saved.optimizer.get(MOVES)
-    return cameras if moves is None else moved_cameras(cameras, moves)
+    if moves is None:
+        return cameras
+    return moved_cameras(cameras, moves)
 
 
 def left_out(device: torch.device) -> str:

@@ -138,18 +138,25 @@ class StyledLevels:
         shown = self._levels.gather(chunks, level)
         # Recolour what was never drawn, level by level, some chunks together.
         keys = list(zip(chunks.tolist(), level.tolist(), strict=True))
-        new = np.array([key not in self._colours for key in keys], bool)
+        rows = []
+        for key in keys:
+            rows.append(key not in self._colours)
+        new = np.array(rows, bool)
         for k in np.unique(level[new]):
             here = chunks[new & (level == k)]
             for first in range(0, len(here), _RECOLOURED_CHUNKS):
                 self._add(here[first : first + _RECOLOURED_CHUNKS], int(k))
         # What was drawn last stays longest.
-        parts = [self._colours[key] for key in keys]
+        parts = []
+        for key in keys:
+            parts.append(self._colours[key])
         for key in keys:
             self._colours.move_to_end(key)
         while self._bytes > _MAX_COLOUR_BYTES:
             self._bytes -= self._colours.popitem(last=False)[1].nbytes
-        return shown.recoloured(torch.cat(parts)) if parts else shown
+        if parts:
+            return shown.recoloured(torch.cat(parts))
+        return shown
 
     def _add(self, chunks: NDArray[np.int64], level: int) -> None:
         """Recolour the Gaussians of chunks and merge them up to a level."""
@@ -157,9 +164,10 @@ class StyledLevels:
         # of its Gaussians.
         levels = self._levels
         gaussians = levels.gather(chunks, np.zeros_like(chunks))
-        index = np.concatenate(
-            [levels.order[_CHUNK_GAUSSIANS * chunk : _CHUNK_GAUSSIANS * (chunk + 1)] for chunk in chunks]
-        ).astype(np.int64)
+        parts = []
+        for chunk in chunks:
+            parts.append(levels.order[_CHUNK_GAUSSIANS * chunk : _CHUNK_GAUSSIANS * (chunk + 1)])
+        index = np.concatenate(parts).astype(np.int64)
         harmonics = self._recolour(gaussians, torch.from_numpy(index))
         for k in range(level):
             if k:
@@ -222,8 +230,12 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
     # Of each chunk the rows of its levels, one after the other, and the balls around what it shows and around
     # its means.
     count = -(-len(order) // _CHUNK_GAUSSIANS)
-    width = [_CHUNK_GAUSSIANS // _MERGED_GAUSSIANS**k for k in range(_LEVEL_COUNT)]
-    tables = [level.rows.numpy() for level in levels]
+    width = []
+    for k in range(_LEVEL_COUNT):
+        width.append(_CHUNK_GAUSSIANS // _MERGED_GAUSSIANS**k)
+    tables = []
+    for level in levels:
+        tables.append(level.rows.numpy())
     parts = []
     begin = np.zeros((count, _LEVEL_COUNT + 1), np.int64)
     spread = np.zeros((count, _LEVEL_COUNT))
@@ -300,7 +312,9 @@ def open_levels(folder: Path, key: str) -> Levels | None:
         with np.load(io.BytesIO(mapped[begin:end])) as tables:
             if str(tables["key"]) != f"{_LEVELS_VERSION} {key}":
                 return None
-            parts = {name: tables[name] for name in _TABLE_NAMES}
+            parts = {}
+            for name in _TABLE_NAMES:
+                parts[name] = tables[name]
             count = int(tables["count"])
             rows = np.frombuffer(mapped, np.float32, begin // 4 - count).reshape(-1, int(tables["width"]))
             order = np.frombuffer(mapped, np.int32, count, begin - 4 * count)

@@ -59,7 +59,10 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         preset = PRESETS[quality.quality]
     merged = None if preset is None else preset.merged
     # Levels of detail were written from what was verified.
-    key = "" if merged is None else checkpoint.digest(run.checkpoints)
+    if merged is None:
+        key = ""
+    else:
+        key = checkpoint.digest(run.checkpoints)
     saved, _ = checkpoint.load_latest(
         run.checkpoints, verify=not key or open_levels(root / _LEVELS_FOLDER, key) is None
     )

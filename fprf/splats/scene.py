@@ -116,7 +116,9 @@ class SplatScene(Scene):
     @cached_property
     def _there(self) -> Gaussians:
         """`shown`, where it is drawn."""
-        return self.shown.to(self.drawn_on) if self.copied is None else self.copied
+        if self.copied is None:
+            return self.shown.to(self.drawn_on)
+        return self.copied
 
     def part(self, rows: slice) -> Gaussians:
         """Some of the Gaussians in the scene's look."""
@@ -159,7 +161,10 @@ class SplatScene(Scene):
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
         """Draw a view, its lens included."""
         # At a part of the resolution a smaller view is drawn, and enlarged.
-        share = self.resolution if resolution is None else resolution
+        if resolution is None:
+            share = self.resolution
+        else:
+            share = resolution
         if share < 1:
             small = cameras.select(torch.tensor([view])).scaled(1 / share)
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())

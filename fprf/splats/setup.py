@@ -148,7 +148,10 @@ def limit_widths(
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
     share = _MAX_WIDTH_IN_CELLS if cells else _MAX_WIDTH
-    every = _WIDTH_EVERY_STEPS_IN_CELLS if cells else _WIDTH_EVERY_STEPS
+    if cells:
+        every = _WIDTH_EVERY_STEPS_IN_CELLS
+    else:
+        every = _WIDTH_EVERY_STEPS
 
     def nearest_camera(points: Annotated[Tensor, "P 3"]) -> Annotated[Tensor, "P"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
@@ -175,7 +178,10 @@ def limit_widths(
             if len(wide):
                 points = torch.from_numpy(gaussians.read(MEANS, wide))
                 together = max(_MIN_GAUSSIANS_AT_ONCE, _MAX_PAIRS_AT_ONCE // len(centres))
-                distance = torch.cat([nearest_camera(part) for part in torch.split(points, together)])
+                parts = []
+                for part in torch.split(points, together):
+                    parts.append(nearest_camera(part))
+                distance = torch.cat(parts)
                 gaussians.limit_scales((share * distance).clamp_min(1e-12).log().numpy(), wide)
 
     return limit
@@ -202,7 +208,10 @@ def find_near(scene: ParsedScene, points: Points) -> float:
     Of some of the points and depths, evenly spread; where no view has any, a thousandth of the scene scale.
     """
     some = torch.from_numpy(points.position[:: -(-len(points.position) // _MAX_NEAR_POINTS)])
-    seen = torch.cat([depth[inside] for _, _, depth, inside in projected(scene, some)])
+    parts = []
+    for _, _, depth, inside in projected(scene, some):
+        parts.append(depth[inside])
+    seen = torch.cat(parts)
     if not len(seen):
         return _NEAR_UNSEEN_SHARE * scene_scale(scene)
     return _NEAR_SHARE * float(seen[:: -(-len(seen) // _MAX_NEAR_DEPTHS)].quantile(0.01))

@@ -185,8 +185,13 @@ def find_views(
     chosen = None
     others = count if camera is None else count - 1
     if inside is not False:
-        place = None if camera is None else camera.pose[0, :, 3].double()
-        max_share = _MAX_ROOM_DEVIATION_SHARE if room else _MAX_DEVIATION_SHARE
+        place = None
+        if camera is not None:
+            place = camera.pose[0, :, 3].double()
+        if room:
+            max_share = _MAX_ROOM_DEVIATION_SHARE
+        else:
+            max_share = _MAX_DEVIATION_SHARE
         chosen = search.around_place(others, max_share, place)
     if chosen is None:
         candidates = None
@@ -255,7 +260,9 @@ class _ViewSearch:
         self.up = up
         self.antialiased = antialiased
         opacity = gaussians.opacities
-        ends = [_quantiles(axis, opacity, _BOX_QUANTILES) for axis in gaussians.means.T]
+        ends = []
+        for axis in gaussians.means.T:
+            ends.append(_quantiles(axis, opacity, _BOX_QUANTILES))
         self.ends = torch.stack(ends).double()
         """Lowest and highest corner [3 2] of the box that most opacity lies in."""
         self.coarse = gaussians

@@ -64,7 +64,9 @@ def parse_place(field: str, text: str) -> Place | None:
     if kind not in ("box", "path"):
         return None
     try:
-        numbers = [tuple(map(float, part.split(","))) for part in parts]
+        numbers = []
+        for part in parts:
+            numbers.append(tuple(map(float, part.split(","))))
     except ValueError:
         numbers = []
     # Corners have three numbers each; what follows them are the sizes.

@@ -204,7 +204,10 @@ def _filtered(
     radius = round(guided.radius * min(height, width))
     cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_FILTER_CELL_PIXELS)
     parts = torch.split(pixel, _FILTERED_ROWS)
-    return torch.cat([apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)) for at in parts])
+    rows = []
+    for at in parts:
+        rows.append(apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)))
+    return torch.cat(rows)
 
 
 def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:

@@ -115,7 +115,10 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
     """
     # Paths go relative, so that the folder can be moved; hashes tell when a photograph changes.
     style = file.style
-    masks = [p for p in style.masks if p != NO_MASK]
+    masks = []
+    for p in style.masks:
+        if p != NO_MASK:
+            masks.append(p)
     whole = {
         "format": _STYLE_FORMAT,
         "fprf": version("fprf"),
@@ -167,7 +170,10 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
     and for a folder of masks of which none fits.
     """
     style = replace(style, masks=_mask_of_each(style))
-    folders = {path for path in style.references if path.is_dir() and not is_scene(path)}
+    folders = set()
+    for path in style.references:
+        if path.is_dir() and not is_scene(path):
+            folders.add(path)
     if not folders and not any(mask.is_dir() for mask in style.masks):
         return style
     from ..datamanagers.images import IMAGE_SUFFIXES, photographs
@@ -192,11 +198,15 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
                 "photographs"
             )
         if path in folders:
-            files = [file for file in within(path) if file not in known]
+            files = []
+            for file in within(path):
+                if file not in known:
+                    files.append(file)
         else:
             files = [path]
         known |= {*files}
-        rows += [(file, weight, mask) for file in files]
+        for file in files:
+            rows.append((file, weight, mask))
     references, weights, masks = zip(*rows, strict=True)
     return replace(
         style,

@@ -271,7 +271,9 @@ def regional(
     if getattr(config, "handles_allowed_references", True):  # what is not installed says so when it is built
         return config.build(dictionary=dictionary._replace(allowed=allowed), scene=scene)
     # One stylizer for each different choice of references.
-    rows = [tuple(row) for row in allowed.tolist()]
+    rows = []
+    for row in allowed.tolist():
+        rows.append(tuple(row))
     choices = sorted(set(rows))
     chosen = []
     for choice in choices:
@@ -441,11 +443,19 @@ class Restyle:
         self, decoder: Decoder, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
-        parts = [part for part in self.parts if part.share > 0]
-        painted = [part.painted(content, semantic) for part in parts]
+        parts = []
+        for part in self.parts:
+            if part.share > 0:
+                parts.append(part)
+        painted = []
+        for part in parts:
+            painted.append(part.painted(content, semantic))
         mixed, luminance = _mixed_features(parts, [each.features for each in painted])
         colour: Tensor = decoder(mixed)
-        active = [(part, each) for part, each in zip(parts, painted, strict=True) if part.strength > 0]
+        active = []
+        for part, each in zip(parts, painted, strict=True):
+            if part.strength > 0:
+                active.append((part, each))
         own = colour
         if luminance > 0 or any(each.paint is not None for _, each in active):
             own = decoder(content)
@@ -476,7 +486,10 @@ class Restyle:
         strength: float | Tensor = self.strength
         if self.regions is not None:
             # Without semantics there is one region, and nothing to look up.
-            there = content[:, :0] if semantic is None else semantic
+            if semantic is None:
+                there = content[:, :0]
+            else:
+                there = semantic
             weight: Tensor = self.regions(there, belongs)
             strength = strength * weight
         painted = strength

@@ -209,7 +209,9 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[ExplainedReg
         pixel = _middle_of(share, width, height)
         part = float(regions.scene_style.share[k])
         rows.append(ExplainedRegion(k, part, scene.names[view], pixel, highlight(picture, share)))
-    return rows if styled is None else _with_taken(rows, regions, styled)
+    if styled is None:
+        return rows
+    return _with_taken(rows, regions, styled)
 
 
 def _best_views(regions: Regions) -> list[int]:
@@ -220,7 +222,10 @@ def _best_views(regions: Regions) -> list[int]:
     for view in looked:
         share, opacity = membership_view(regions, view, _LOOKED_SIDE_PIXELS)
         mass.append((share * opacity[..., None]).mean((0, 1)))
-    return [looked[int(column.argmax())] for column in torch.stack(mass).T]
+    found: list[int] = []
+    for column in torch.stack(mass).T:
+        found.append(looked[int(column.argmax())])
+    return found
 
 
 def _middle_of(share: Annotated[Tensor, "H W"], width: int, height: int) -> tuple[int, int]:

@@ -70,7 +70,9 @@ def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D
     if not r.numel():
         return 1.0
     spread = float((r - r.mean(1, keepdim=True)).square().mean().sqrt())
-    return spread if spread > _ROUNDING_SHARE * float(r.abs().max()) else 1.0
+    if spread > _ROUNDING_SHARE * float(r.abs().max()):
+        return spread
+    return 1.0
 
 
 def attention(

@@ -109,7 +109,10 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
         found = _regions_under_mask(regions, view, as_path(rest))
     else:
         found = {_region_at_pixel(regions, view, pixel, text)}
-    return [RegionMatch(k, str(k)) for k in sorted(found)]
+    result: list[RegionMatch] = []
+    for k in sorted(found):
+        result.append(RegionMatch(k, str(k)))
+    return result
 
 
 def _view_named_in(regions: Regions, text: str) -> int:
@@ -267,7 +270,10 @@ class _Asked(NamedTuple):
     @property
     def pinned(self) -> set[int]:
         """Numbers of the regions that are pinned."""
-        return {match.number for match, _ in self.pins}
+        found: set[int] = set()
+        for match, _ in self.pins:
+            found.add(match.number)
+        return found
 
 
 def _find_asked(names: "_StyleNames", style: StyleConfig) -> _Asked:
@@ -281,14 +287,17 @@ def _find_asked(names: "_StyleNames", style: StyleConfig) -> _Asked:
         else:
             _, chosen = places.setdefault(pin.region, (place, set()))
             chosen.add(find_reference(pin.value, style.references))
-    bans = [parse_region_value("forbid", text) for text in style.forbid]
+    bans = []
+    for text in style.forbid:
+        bans.append(parse_region_value("forbid", text))
     kept: list[RegionMatch] = []
     for text in style.keep:
         kept += names.find(text)
     strengths: list[tuple[RegionMatch, float]] = []
     for text in style.region_strength:
         region, value = parse_strength("region_strength", text)
-        strengths += [(match, value) for match in names.find(region)]
+        for match in names.find(region):
+            strengths.append((match, value))
     asked = _Asked(names.find_pairs(pins), names.find_pairs(bans), kept, strengths, places)
     partly = asked.pinned | {match.number for match, _ in strengths}
     for match in kept:
@@ -357,9 +366,12 @@ def _places_allowed(
 
 def _portable_style(names: "_StyleNames", asked: _Asked, style: StyleConfig) -> StyleConfig:
     """The style with regions named by keys, which hold on other scenes, and references by file."""
-    pins = [f"{names.region(match)}={names.reference(i)}" for match, i in asked.pins]
+    pins = []
+    for match, i in asked.pins:
+        pins.append(f"{names.region(match)}={names.reference(i)}")
     for text, (_, chosen) in asked.places.items():
-        pins += [f"{text}={names.reference(i)}" for i in sorted(chosen)]
+        for i in sorted(chosen):
+            pins.append(f"{text}={names.reference(i)}")
     return replace(
         style,
         pin=tuple(pins),
@@ -386,7 +398,10 @@ class _StyleNames:
         for k in range(len(regions.scene_style.share)):
             if regions.basis is not None:
                 every[f"region{k}"] = key_of(regions, k)
-        self.keys = dict(regions.keys) if regions.keys_fit else every
+        if regions.keys_fit:
+            self.keys = dict(regions.keys)
+        else:
+            self.keys = every
         self.notes: list[str] = []
 
     def find(self, text: str) -> list[RegionMatch]:

@@ -190,7 +190,9 @@ def keyed_looks(scene: Scene, keys: Sequence[Keyframe]) -> Callable[[int], Resty
             for note in styled.controls.notes:
                 print(f"{key.style}: {note}")
     # Between two keys one look fades into the other; to and from the plain scene by its strength.
-    frames = [key.frame for key in keys]
+    frames = []
+    for key in keys:
+        frames.append(key.frame)
 
     def look(at: int) -> Restyle | None:
         before, after, way = fade(frames, at)

@@ -75,7 +75,10 @@ def scene_style(
     """
     if not bool(weights.any()):
         raise DataError("scene statistics: no point has weight; the scene renders empty, train it for longer")
-    whole = moments_of(content, weights) if moments is None else moments
+    if moments is None:
+        whole = moments_of(content, weights)
+    else:
+        whole = moments
     # Points that render nothing say nothing, whatever they hold.
     keep = weights > 0
     content = content[keep]
@@ -264,7 +267,10 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
     """A scene's style out of a checkpoint. Raises CheckpointError for missing or misshapen fields."""
     if "contacts" not in tensors and "share" in tensors:  # a run from before they were measured
         tensors = {**tensors, "contacts": tensors["share"].new_zeros(2 * tuple(tensors["share"].shape))}
-    missing = [name for name in SceneStyle._fields if name not in tensors]
+    missing = []
+    for name in SceneStyle._fields:
+        if name not in tensors:
+            missing.append(name)
     if missing:
         raise CheckpointError(f"scene statistics: {', '.join(missing)} missing; compute the statistics again")
     scene = SceneStyle(**{name: tensors[name] for name in SceneStyle._fields})

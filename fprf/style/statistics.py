@@ -119,11 +119,20 @@ def group_moments(
     for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T):
         groups.append(moments(features[inside.to(features.device)], membership[inside, k]))
     # Shares of all weight; where there is none at all they are 0, not NaN.
-    weight = torch.stack([g.weight for g in groups])
-    mean = torch.stack([g.mean for g in groups])
+    parts = []
+    for g in groups:
+        parts.append(g.weight)
+    weight = torch.stack(parts)
+    parts = []
+    for g in groups:
+        parts.append(g.mean)
+    mean = torch.stack(parts)
+    parts = []
+    for g in groups:
+        parts.append(covariance(g))
     return (
         mean,
-        torch.stack([covariance(g) for g in groups]),
+        torch.stack(parts),
         weight / weight.sum().clamp_min(torch.finfo().tiny),
     )
 

@@ -67,7 +67,9 @@ def space() -> Space:
 def capture(folder: Path) -> ParsedScene:
     """Five pictures of noise of several sizes, written to a folder; the second is held out."""
     sizes = torch.tensor([[24, 16], [30, 20], [18, 26], [24, 16], [12, 10]])
-    paths = [folder / f"{view}.png" for view in range(len(sizes))]
+    paths = []
+    for view in range(len(sizes)):
+        paths.append(folder / f"{view}.png")
     for view, (width, height) in enumerate(sizes.tolist()):
         write_image(paths[view], (255 * uniform(height, width, 3, seed=30 + view)).byte().numpy())
     cameras = Cameras(

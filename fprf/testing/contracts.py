@@ -110,7 +110,9 @@ def _built(
     )
     assert isinstance(made, kind)
     module: object = made
-    other = build() if again and isinstance(module, nn.Module) else None
+    other = None
+    if again and isinstance(module, nn.Module):
+        other = build()
     if isinstance(module, nn.Module) and isinstance(other, nn.Module):
         mine = module.state_dict()
         theirs = other.state_dict()
@@ -205,7 +207,9 @@ def check_stylizer(config: StylizerConfig) -> None:
         # Features on which nothing was fitted; semantics only where it says that it reads them.
         content = cases.normal(11, 8, seed=22)
         semantic = cases.normal(11, dims, seed=13)
-        given = semantic if Want.SEMANTIC in stylizer.needs else None
+        given = None
+        if Want.SEMANTIC in stylizer.needs:
+            given = semantic
         styled = stylizer(content, given)
         tensor(styled, (11, 8), name)
         same(stylizer(content, given), styled, 0.0, f"{name}: must be deterministic")
@@ -475,12 +479,15 @@ def check_data_manager(config: DataManagerConfig) -> None:
         corner = batch.pixel - 0.5
         inside = (corner == corner.floor()) & (corner >= 0) & (corner < scene.cameras.size[batch.view])
         require(bool(inside.all()), f"{name}: pixels must be centres, at +0.5, within their image")
-        images = [manager.image(view) for view in range(len(scene.paths))]
+        images = []
+        for view in range(len(scene.paths)):
+            images.append(manager.image(view))
         for image, (width, height) in zip(images, scene.cameras.size.tolist(), strict=True):
             tensor(image, (height, width, 3), f"{name}: image", low=0.0, high=1.0)
-        shown = torch.stack(
-            [images[v][y, x] for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True)]
-        )
+        parts = []
+        for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True):
+            parts.append(images[v][y, x])
+        shown = torch.stack(parts)
         same(batch.rgb, shown, 1e-6, f"{name}: rgb must be the colour of the pixel, as image() gives it")
         # Stores say what units and how many channels the fields are built with.
         content = manager.content_store

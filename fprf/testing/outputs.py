@@ -86,7 +86,10 @@ def close(found: Tensor, wanted: Tensor, tolerance: float) -> bool:
     """Equal to within a tolerance relative to the largest value (1 at least)."""
     if not wanted.numel():
         return found.shape == wanted.shape
-    scale = max(1.0, float(wanted.abs().max())) if tolerance else 1.0
+    if tolerance:
+        scale = max(1.0, float(wanted.abs().max()))
+    else:
+        scale = 1.0
     return bool(((found - wanted).abs() <= tolerance * scale).all())
 
 
@@ -139,7 +142,10 @@ def penalties(part: ContentField | SemanticField | Sampler, name: str) -> None:
 
 def trainable(module: nn.Module, loss: Tensor, name: str) -> None:
     """Require a finite gradient for every parameter that wants one."""
-    named = {key: value for key, value in module.named_parameters() if value.requires_grad}
+    named = {}
+    for key, value in module.named_parameters():
+        if value.requires_grad:
+            named[key] = value
     require(loss.requires_grad or not named, f"{name}: no gradient goes through its answer")
     if named:
         gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True)
@@ -286,7 +292,9 @@ def check_stylizer(
     semantic = spread(scene.semantic_mean)
     with naming_plugin(config):
         check_needs(stylizer, "needs")
-        given = semantic if Want.SEMANTIC in stylizer.needs else None
+        given = None
+        if Want.SEMANTIC in stylizer.needs:
+            given = semantic
         styled = asked("features", lambda some: stylizer(some, given), content)
         tensor(styled, tuple(content.shape), "features")
         shares(asked("matches", stylizer.match, semantic), (POINTS, len(dictionary.keys)), "matches", 1e-3)

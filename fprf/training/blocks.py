@@ -116,7 +116,9 @@ def assemble(
 ) -> Model:
     """A model whose points are routed to members."""
     sampler = BlockedSampler(config.sampler.build(seed=config.seed), members, router)
-    semantic = BlockedSemantic(members, router) if facts.of_field.dim else None
+    semantic = None
+    if facts.of_field.dim:
+        semantic = BlockedSemantic(members, router)
     return Model(Parts(facts.space, sampler, BlockedField(members, router), semantic, decoder), tones, poses)
 
 

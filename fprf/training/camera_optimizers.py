@@ -140,7 +140,10 @@ def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
         about = axis.expand_as(place)
         columns.append(torch.cat([about, torch.linalg.cross(about, place)], -1))
     columns.append(torch.cat([none, place], -1))
-    matrix = torch.stack([column.reshape(-1) for column in columns], -1)
+    parts = []
+    for column in columns:
+        parts.append(column.reshape(-1))
+    matrix = torch.stack(parts, -1)
     if not matrix.numel():
         return matrix
     basis, size, _ = torch.linalg.svd(matrix, full_matrices=False)

@@ -88,7 +88,9 @@ def tidy(root: Path) -> None:
     """Remove what was cut short: folders without a manifest, unfinished files. Only where nobody else
     writes.
     """
-    complete = {_folder(root, step) for step in steps(root)}
+    complete = set()
+    for step in steps(root):
+        complete.add(_folder(root, step))
     for folder in root.glob("step-*"):
         if folder in complete:
             remove_unfinished(folder)
@@ -105,8 +107,14 @@ def load(root: Path, step: int, *, verify: bool = True) -> Saved:
     files = {}
     for name, entries in manifest.files.items():
         files[name] = (folder / f"{name}.safetensors", entries)
-    model = tensorfiles.load(*files["model"]) if verify else tensorfiles.read(files["model"][0])
-    optimizer = tensorfiles.load(*files["optimizer"]) if verify else tensorfiles.read(files["optimizer"][0])
+    if verify:
+        model = tensorfiles.load(*files["model"])
+    else:
+        model = tensorfiles.read(files["model"][0])
+    if verify:
+        optimizer = tensorfiles.load(*files["optimizer"])
+    else:
+        optimizer = tensorfiles.read(files["optimizer"][0])
     return Saved(step, manifest.seconds, model, optimizer)
 
 
@@ -114,7 +122,9 @@ def digest(root: Path) -> str:
     """Return a short key of the tensors in the newest checkpoint's manifest; empty without one."""
     kept = steps(root)
     try:
-        return f"{_read(root, kept[-1]).checksum:08x}" if kept else ""
+        if kept:
+            return f"{_read(root, kept[-1]).checksum:08x}"
+        return ""
     except CheckpointError:
         return ""
 
@@ -169,7 +179,9 @@ def misfit(module: nn.Module, tensors: Mapping[str, Tensor]) -> str | None:
     for name in own:
         if name not in tensors or own[name].shape != tensors[name].shape:
             wrong.append(name)
-    wrong += [name for name in tensors if name not in own]
+    for name in tensors:
+        if name not in own:
+            wrong.append(name)
     return wrong[0] if wrong else None
 
 

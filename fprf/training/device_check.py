@@ -156,7 +156,10 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
         with torch.no_grad():
             for parameter, gradient in zip(learned, gradients, strict=True):
                 parameter.sub_(gradient, alpha=0.1)
-    return torch.cat([gradient.reshape(-1) for gradient in gradients])
+    parts = []
+    for gradient in gradients:
+        parts.append(gradient.reshape(-1))
+    return torch.cat(parts)
 
 
 @torch.no_grad()

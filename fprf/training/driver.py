@@ -147,7 +147,10 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
 
 def default_output(config: RunConfig, method: str) -> Path:
     """runs/SCENE-METHOD."""
-    name = "" if config.data is None else config.data.resolve().name
+    if config.data is None:
+        name = ""
+    else:
+        name = config.data.resolve().name
     return Path("runs") / f"{name or 'scene'}-{method}"
 
 

@@ -299,7 +299,10 @@ class StepStatistics:
         """
         self.skipped = self.skipped + unfit
         self.failed = (self.failed + 1) * unfit
-        new = [name for name in values if name not in self.names]
+        new = []
+        for name in values:
+            if name not in self.names:
+                new.append(name)
         if new:
             self.names += new
             self.rows = torch.nn.functional.pad(self.rows, (0, len(new)))
@@ -311,7 +314,10 @@ class StepStatistics:
             for name in self.names:
                 marks.append(torch.full_like(self.none, float(name in values)))
             self._present[given] = torch.stack(marks).to(self.rows.dtype)
-        row = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
+        parts = []
+        for name in self.names:
+            parts.append(values.get(name, self.none))
+        row = torch.stack(parts).to(self.rows.dtype)
         # Where a value is not finite neither its sum nor its weight moves: the mean stays what it was.
         fit = torch.isfinite(row)
         means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([row, self._present[given]])

@@ -72,7 +72,10 @@ def _history(name: str, file: Path) -> History:
     values: dict[str, list[float | None]] = {}
     for event in lines:
         losses = event.get("losses")
-        whole = event | losses if isinstance(losses, dict) else event
+        if isinstance(losses, dict):
+            whole = event | losses
+        else:
+            whole = event
         flat.append(whole)
         for key in whole:
             if key not in ("step", "seconds", "losses"):

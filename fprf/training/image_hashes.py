@@ -59,8 +59,12 @@ def check_images(root: Path, scene: ParsedScene, hashes: Mapping[str, str]) -> N
     for name in hashes:
         if name in before and before[name] != hashes[name]:
             changed.append(f"{files[name]} is another")
-    changed += [f"{files[name]} is new" for name in hashes if name not in before]
-    changed += [f"{name} is gone" for name in before if name not in hashes]
+    for name in hashes:
+        if name not in before:
+            changed.append(f"{files[name]} is new")
+    for name in before:
+        if name not in hashes:
+            changed.append(f"{name} is gone")
     if changed:
         if len(changed) > _MAX_LISTED:
             more = f" and {len(changed) - _MAX_LISTED} more"

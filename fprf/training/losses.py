@@ -58,7 +58,10 @@ def check_penalties(config: LossConfig, model: Model) -> None:
 
 def wanted(config: LossConfig, batch: Batch, extra: LossTerm | None = None) -> Want:
     """Outputs of the renderer that terms of weight above 0 need."""
-    want = Want.DENSITY if extra is None else Want.DENSITY | extra.needs
+    if extra is None:
+        want = Want.DENSITY
+    else:
+        want = Want.DENSITY | extra.needs
     if config.rgb > 0:
         want |= Want.COLOUR
     if config.content > 0 and batch.content is not None:
@@ -120,7 +123,10 @@ def terms(
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)
     # Regularisers of all parameters cost as much as a batch, and need not follow every one.
-    wanted_penalties = {name for name in model.penalty_names if _penalty_weight(config, name) > 0}
+    wanted_penalties = set()
+    for name in model.penalty_names:
+        if _penalty_weight(config, name) > 0:
+            wanted_penalties.add(name)
     if step % config.penalty_every == 0 and wanted_penalties:
         for name, value in model.penalties().items():
             if name in wanted_penalties:
@@ -143,8 +149,14 @@ def ending(
     known = torch.isfinite(ends)
     ends = torch.where(known, ends, 0.5)
     # In NDC 1 - t is in proportion to 1 / depth.
-    low = 1 - (1 - ends) / (1 - NEARBY) if ndc else ends * (1 - NEARBY)
-    high = 1 - (1 - ends) / (1 + NEARBY) if ndc else ends * (1 + NEARBY)
+    if ndc:
+        low = 1 - (1 - ends) / (1 - NEARBY)
+    else:
+        low = ends * (1 - NEARBY)
+    if ndc:
+        high = 1 - (1 - ends) / (1 + NEARBY)
+    else:
+        high = ends * (1 + NEARBY)
     start = t[:, :-1]
     stop = t[:, 1:]
     # Weight before the point would hide it; what lies behind it is not known.
@@ -183,7 +195,10 @@ def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> T
     every = config.penalty_every
     weighted = []
     for name, value in parts.items():
-        weight = weights[name] if name in weights else _penalty_weight(config, name) * every
+        if name in weights:
+            weight = weights[name]
+        else:
+            weight = _penalty_weight(config, name) * every
         weighted.append(weight * value)
     return torch.stack(weighted).sum()
 

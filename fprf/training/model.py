@@ -59,7 +59,11 @@ class Model(nn.Module):
 
     def learned(self) -> list[nn.Parameter]:
         """Parameters that training moves, in a fixed order: everything but what decoders bring frozen."""
-        return [p for p in self.parameters() if p.requires_grad]
+        found: list[nn.Parameter] = []
+        for p in self.parameters():
+            if p.requires_grad:
+                found.append(p)
+        return found
 
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers of all parts by name; those of one name are added up."""

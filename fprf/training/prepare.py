@@ -52,7 +52,10 @@ def read_scene(config: RunConfig, saved: Facts | None = None) -> ParsedScene:
     Raises UsageError where it names none, DataError where that cannot be read.
     """
     whole = read_whole_scene(config)
-    sized = planned(config, whole) if config.downscale is None else config
+    if config.downscale is None:
+        sized = planned(config, whole)
+    else:
+        sized = config
     return scene_at_size(sized, whole, saved)
 
 
@@ -66,8 +69,13 @@ def read_whole_scene(config: RunConfig) -> ParsedScene:
 def scene_at_size(config: RunConfig, whole: ParsedScene, saved: Facts | None = None) -> ParsedScene:
     """A scene that was read at its own size, at that of a planned config, about the origin of a run that goes on."""
     size = config.downscale or 1
-    scene = whole if size == 1 else replace(whole, cameras=whole.cameras.scaled(size))
-    return scene if saved is None else at_origin(scene, saved.origin)
+    if size == 1:
+        scene = whole
+    else:
+        scene = replace(whole, cameras=whole.cameras.scaled(size))
+    if saved is None:
+        return scene
+    return at_origin(scene, saved.origin)
 
 
 def facts_of(

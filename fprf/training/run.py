@@ -100,7 +100,9 @@ class Known:
         width, height = self.cameras.size[view].tolist()
         pixels = load_image(captured.paths[view], (width, height), self.facts.background)
         image = torch.from_numpy(pixels).float() / 255
-        mask = captured.masks[view] if captured.masks and masks else None
+        mask = None
+        if captured.masks and masks:
+            mask = captured.masks[view]
         where = None
         if mask is not None:
             where = torch.from_numpy(load_mask(mask, (width, height)))
@@ -227,7 +229,10 @@ def view_names(paths: Sequence[Path]) -> list[str]:
             names.append("-".join([*(f.name for f in p.parents[:folders][::-1]), p.stem]))
         if len(set(names)) == len(names):
             return names
-    return [f"{i:05d}-{p.stem}" for i, p in enumerate(paths)]
+    found: list[str] = []
+    for i, p in enumerate(paths):
+        found.append(f"{i:05d}-{p.stem}")
+    return found
 
 
 try:

@@ -234,8 +234,13 @@ def renumber(folder: Path, asked: Mapping[int, str]) -> None:
     tasks = {}
     for mark in sorted(folder.glob(f"*/{_TASK}")):
         tasks[mark.parent] = task_of(mark.parent)
-    known = {part: task for part, task in tasks.items() if task is not None}
-    targets = {number: folder / f"{number:02d}" for number in asked}
+    known = {}
+    for part, task in tasks.items():
+        if task is not None:
+            known[part] = task
+    targets = {}
+    for number in asked:
+        targets[number] = folder / f"{number:02d}"
     # Those that are where they belong stay; of the others each number takes the first that was begun as what
     # it is asked for.
     moves: dict[int, Path] = {}

@@ -150,7 +150,10 @@ def _on_host(view: View) -> View:
     """A view on the CPU, copied from an accelerator in one piece, since the host waits for each copy."""
     if view.rgb.device.type == "cpu":
         return view
-    flat = torch.cat([each.reshape(-1) for each in (view.rgb, view.depth, view.opacity)]).cpu()
+    parts = []
+    for each in (view.rgb, view.depth, view.opacity):
+        parts.append(each.reshape(-1))
+    flat = torch.cat(parts).cpu()
     rgb, depth, opacity = torch.split_with_sizes(
         flat, [view.rgb.numel(), view.depth.numel(), view.opacity.numel()]
     )
@@ -199,9 +202,10 @@ class CachedView(SceneView):
         semantics = []
         for chunk in self.chunks:
             semantics.append(chunk.content[:, :0] if chunk.semantic is None else chunk.semantic)
-        return torch.cat(
-            [chunk.mean(values(at, None)).cpu() for chunk, at in zip(self.chunks, semantics, strict=True)]
-        )
+        parts = []
+        for chunk, at in zip(self.chunks, semantics, strict=True):
+            parts.append(chunk.mean(values(at, None)).cpu())
+        return torch.cat(parts)
 
     @property
     def bytes(self) -> int:

@@ -56,13 +56,20 @@ class CaptureContents:
 
 def index_tensor(members: Sequence[bool]) -> Tensor:
     """The int64 positions of the members."""
-    return torch.tensor([k for k, member in enumerate(members) if member], dtype=torch.int64)
+    parts = []
+    for k, member in enumerate(members):
+        if member:
+            parts.append(k)
+    return torch.tensor(parts, dtype=torch.int64)
 
 
 def split_by(held: Sequence[bool]) -> tuple[Tensor, Tensor] | None:
     """Indices (train, test), int64, of views of which some are held out; None where all or none are."""
     if len({*held}) > 1:
-        return (index_tensor([not each for each in held]), index_tensor(held))
+        parts = []
+        for each in held:
+            parts.append(not each)
+        return (index_tensor(parts), index_tensor(held))
     return None
 
 
@@ -72,8 +79,12 @@ def assemble_scene(data: Path, contents: CaptureContents, *, downscale: float) -
     """
     contents = without_copies(contents)
     views = contents.views
-    headers = [read_header(view.path) for view in views]
-    sizes = [(header.width, header.height) for header in headers]
+    headers = []
+    for view in views:
+        headers.append(read_header(view.path))
+    sizes = []
+    for header in headers:
+        sizes.append((header.width, header.height))
     scaling = check_sizes(views, sizes, reduced=contents.reduced)
     cameras = _cameras(views).resized(torch.tensor(sizes))
     train, test = contents.split or _default_split(len(views))
@@ -109,7 +120,9 @@ def _cameras(views: Sequence[View]) -> Cameras:
 
 
 def _tensor(array: NDArray[np.float64] | NDArray[np.int64] | None) -> Tensor | None:
-    return None if array is None or not len(array) else torch.from_numpy(array)
+    if array is None or not len(array):
+        return None
+    return torch.from_numpy(array)
 
 
 def _of_all(values: Sequence[object]) -> Tensor | None:
@@ -123,13 +136,21 @@ def _default_split(count: int) -> tuple[Tensor, Tensor]:
     """Every 8th is for testing, the first one too; but a single view is for training: there must be something to
     learn.
     """
-    held = [k % _TEST_EVERY == 0 and count > 1 for k in range(count)]
-    return index_tensor([not each for each in held]), index_tensor(held)
+    held = []
+    for k in range(count):
+        held.append(k % _TEST_EVERY == 0 and count > 1)
+    parts = []
+    for each in held:
+        parts.append(not each)
+    return index_tensor(parts), index_tensor(held)
 
 
 def _is_transparent(views: Sequence[View], headers: Sequence[ImageHeader]) -> bool:
     """True where one of a few images with an alpha channel is not opaque everywhere."""
-    clear = [view.path for view, header in zip(views, headers, strict=True) if header.alpha]
+    clear = []
+    for view, header in zip(views, headers, strict=True):
+        if header.alpha:
+            clear.append(view.path)
     step = -(-len(clear) // _MAX_DECODED_ALPHA) or 1
     return any(map(has_transparency, clear[::step]))
 
@@ -139,14 +160,20 @@ def without_copies(contents: CaptureContents) -> CaptureContents:
     before one for training, else that of the shorter name.
     """
     views = contents.views
-    held = set() if contents.split is None else set(contents.split[1].tolist())
+    if contents.split is None:
+        held = set()
+    else:
+        held = set(contents.split[1].tolist())
     copies = {}
     for group in _same_views(views):
         order = sorted(group, key=lambda k: (k not in held, len(views[k].name), views[k].name))
         copies.update(dict.fromkeys(order[1:], order[0]))
     if not copies:
         return contents
-    kept = [k for k in range(len(views)) if k not in copies]
+    kept = []
+    for k in range(len(views)):
+        if k not in copies:
+            kept.append(k)
     place = torch.full((len(views),), -1, dtype=torch.int64)
     place[kept] = torch.arange(len(kept))
     split = None
@@ -157,9 +184,9 @@ def without_copies(contents: CaptureContents) -> CaptureContents:
     if seen is not None:
         seen = np.stack([place.numpy()[seen[:, 0]], seen[:, 1]], 1)
         seen = seen[seen[:, 0] >= 0]
-    names = [
-        f"{views[copy].name}, which is {views[original].name}" for copy, original in sorted(copies.items())
-    ]
+    names = []
+    for copy, original in sorted(copies.items()):
+        names.append(f"{views[copy].name}, which is {views[original].name}")
     return replace(
         contents,
         views=[views[k] for k in kept],
@@ -171,15 +198,23 @@ def without_copies(contents: CaptureContents) -> CaptureContents:
 
 def _same_views(views: Sequence[View]) -> list[list[int]]:
     """Groups of views of one camera and one picture."""
-    group = {k: [k] for k in range(len(views))}
+    group = {}
+    for k in range(len(views)):
+        group[k] = [k]
     digests: dict[Path, str] = {}
     for a, b in _near_pairs(np.stack([view.pose for view in views])):
         if group[a] is not group[b] and _same_picture(views[a].path, views[b].path, digests):
             group[a] += group[b]
             for k in group[b]:
                 group[k] = group[a]
-    unique = {id(members): members for members in group.values()}
-    return [members for members in unique.values() if len(members) > 1]
+    unique = {}
+    for members in group.values():
+        unique[id(members)] = members
+    found: list[list[int]] = []
+    for members in unique.values():
+        if len(members) > 1:
+            found.append(members)
+    return found
 
 
 def _near_pairs(pose: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
@@ -221,7 +256,10 @@ def check_sizes(views: Sequence[View], sizes: Sequence[tuple[int, int]], *, redu
     Raises DataError naming the images that differ, unless all are reduced by one factor, or where `reduced`, by
     any one that keeps their shape. Reducing rounds a side to a whole pixel.
     """
-    stated = np.array([view.size for view in views], dtype=np.float64)
+    parts = []
+    for view in views:
+        parts.append(view.size)
+    stated = np.array(parts, dtype=np.float64)
     found = np.array(sizes, dtype=np.float64)
     exact = (stated == found).all(1)
     if exact.all():
@@ -264,7 +302,10 @@ def _of_one_scale(stated: NDArray[np.float64], found: NDArray[np.float64]) -> ND
 def _wrong_sizes(views: Sequence[View], sizes: Sequence[tuple[int, int]], wrong: Sequence[int]) -> DataError:
     view = views[wrong[0]]
     width, height = sizes[wrong[0]]
-    more = f" and {len(wrong) - 1} more of {len(views)} likewise" if len(wrong) > 1 else ""
+    if len(wrong) > 1:
+        more = f" and {len(wrong) - 1} more of {len(views)} likewise"
+    else:
+        more = ""
     return DataError(
         f"{view.path}: {width}x{height} pixels, but its camera has {view.size[0]}x{view.size[1]}{more}; cameras are scaled "
         "where all images are reduced by one factor: restore these (were they resized, rotated or cropped?) or calibrate again"
@@ -277,11 +318,17 @@ def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], kind
     """
     if not any(named):
         return masks_beside(data, [view.path for view in views], kind)
-    missing = [path for path in named if path is not None and not path.is_file()]
+    missing = []
+    for path in named:
+        if path is not None and not path.is_file():
+            missing.append(path)
     if missing:
         told = f"{len(missing)} masks are missing, the first is {missing[0]}"
         raise DataError(f"{data}: {told}; copy them there or unname them")
-    bare = [view.name for view, path in zip(views, named, strict=True) if path is None]
+    bare = []
+    for view, path in zip(views, named, strict=True):
+        if path is None:
+            bare.append(view.name)
     notes = []
     if bare:
         count = f"{len(bare)} of {len(views)} images"

@@ -315,7 +315,9 @@ def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[N
 def cloud_of_images(model: ColmapModel, observed: Sequence[NDArray[np.int64]]) -> Cloud:
     """Finite points of a model, and the pairs of views, in the order of `observed`, and points, each once."""
     # A view may observe a point with several features.
-    views = [np.unique(rows) for rows in observed]
+    views = []
+    for rows in observed:
+        views.append(np.unique(rows))
     pairs = np.stack(
         [np.repeat(np.arange(len(views)), [len(rows) for rows in views]), np.concatenate(views)], 1
     )

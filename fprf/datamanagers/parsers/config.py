@@ -145,7 +145,9 @@ class TransformsConfig(DataParserConfig):
                 known.append(name)
         if known:
             return Recognised(0.9, known[0])
-        return Recognised(0.4, names[0]) if len(names) == 1 else None
+        if len(names) == 1:
+            return Recognised(0.4, names[0])
+        return None
 
     def build(self) -> DataParser:
         from .transforms import TransformsParser
@@ -220,7 +222,9 @@ class BlockNerfConfig(DataParserConfig):
             for path in data.glob(f"{depth}.tfrecord*")
         )
         record = next(filter(is_record, names), None)
-        return Recognised(0.3, record) if record is not None else None
+        if record is not None:
+            return Recognised(0.3, record)
+        return None
 
     def build(self) -> DataParser:
         from .blocknerf import BlockNerfParser
@@ -252,7 +256,9 @@ class PhotoTourismConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By the only *.tsv beside a model, or beside `dense` with a model."""
-        tables = [path.name for path in data.glob("[!.]*.tsv")]
+        tables = []
+        for path in data.glob("[!.]*.tsv"):
+            tables.append(path.name)
         modelled = model_folders(data) or model_folders(data / "dense")
         if len(tables) == 1 and modelled:
             return Recognised(0.6, tables[0])

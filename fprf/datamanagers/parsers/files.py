@@ -75,7 +75,9 @@ def read_float(text: str) -> float:
     """A number as text; NaN for what C++ writes of those that are not finite. Raises ValueError for anything
     else.
     """
-    return math.nan if _NOT_FINITE.fullmatch(text) else float(text)
+    if _NOT_FINITE.fullmatch(text):
+        return math.nan
+    return float(text)
 
 
 _CONTROL = re.compile("[\0-\x08\n-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
@@ -132,7 +134,9 @@ def image_folder(folder: Path) -> tuple[Path, list[str]]:
     """A folder of images, and no note; where it is not there or holds none, the copies that are reduced least, and
     a note that says so.
     """
-    copies = None if holds_images(folder) else reduced_copies(folder)
+    copies = None
+    if not holds_images(folder):
+        copies = reduced_copies(folder)
     if copies is None:
         return folder, []
     return copies, [f"{folder} is not there: {copies} is read"]
@@ -339,7 +343,10 @@ class Record:
         if value is None:
             return None
         if isinstance(value, list):
-            strings = [item for item in value if isinstance(item, str)]
+            strings = []
+            for item in value:
+                if isinstance(item, str):
+                    strings.append(item)
         else:
             strings = []
         if not isinstance(value, list) or len(strings) != len(value):
@@ -357,7 +364,9 @@ class Record:
         """A list of one or more rows of `width` numbers, finite or not."""
         value = self.get(key)
         if isinstance(value, list):
-            rows = [_numbers(row, width) for row in value]
+            rows = []
+            for row in value:
+                rows.append(_numbers(row, width))
         else:
             rows = []
         if not rows or None in rows:
@@ -409,7 +418,9 @@ def _numbers(value: Json, count: int) -> list[float] | None:
     for number in map(_number, cells):
         if number is not None:
             numbers.append(number)
-    return numbers if len(numbers) == len(cells) == count else None
+    if len(numbers) == len(cells) == count:
+        return numbers
+    return None
 
 
 def as_record(where: str | Path, value: Json, common: dict[str, Json] | None = None) -> Record:
@@ -428,4 +439,6 @@ def _short(value: Json) -> str:
         text = "a list"
     else:
         text = "an object"
-    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+    if len(text) <= _MAX_SHOWN:
+        return text
+    return text[: _MAX_SHOWN - 3] + "..."

@@ -85,7 +85,10 @@ def _named_images(folder: Path, count: int) -> tuple[list[str], list[str]]:
     for path, original in equal_pictures(found.files).items():
         if original.stem in path.stem:
             copies.append(path)
-    names = [path.name for path in found.files if path not in copies]
+    names = []
+    for path in found.files:
+        if path not in copies:
+            names.append(path.name)
     if len(names) != count:
         raise DataError(
             f"{folder}: {len(every)} images, but poses_bounds.npy has {count} rows, one for each in the order of "

@@ -39,7 +39,8 @@ class MegaNerfParser(DataParser):
         for part in ("train", "val"):
             folder = data / part / "metadata"
             images, notes = image_folder(data / part / "rgbs")
-            files += [(file, images) for file in folder.glob("[!.]*.pt")]
+            for file in folder.glob("[!.]*.pt"):
+                files.append((file, images))
             said += notes
             if not files:
                 raise DataError(

@@ -60,7 +60,9 @@ class PolycamParser(DataParser):
 
 def _frames(images: Path, cameras: Path) -> tuple[dict[str, tuple[Path, Path]], set[str]]:
     """Images with their cameras' files by their common stem, and the stems of all images."""
-    known = {path.stem for path in cameras.glob("[!.]*.json")}
+    known = set()
+    for path in cameras.glob("[!.]*.json"):
+        known.add(path.stem)
     posed = {}
     every = set()
     for path in images.glob("[!.]*"):

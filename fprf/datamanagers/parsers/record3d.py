@@ -52,9 +52,15 @@ class Record3DParser(DataParser):
                 others.append(path.name)
         numbered.sort()
         count = len(recorded.poses)
-        posed = [each for each in numbered if each[0] < count]
+        posed = []
+        for each in numbered:
+            if each[0] < count:
+                posed.append(each)
         if not posed:
-            last = numbered[-1][1] if numbered else "nothing numbered"
+            if numbered:
+                last = numbered[-1][1]
+            else:
+                last = "nothing numbered"
             raise DataError(
                 f"{folder}: {last}, but {file.name} has {count} poses, from 0 on; export the recording again"
             )

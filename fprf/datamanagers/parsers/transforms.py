@@ -67,7 +67,9 @@ class TransformsParser(DataParser):
     def parse(self, data: Path, downscale: float) -> ParsedScene:
         """The scene at 1/downscale of the size of its images."""
         files = self._files(data)
-        tops = [as_record(file, read_json(file)) for file, _ in files]
+        tops = []
+        for file, _ in files:
+            tops.append(as_record(file, read_json(file)))
         inside = NamedFiles(data)
         entries = []
         for top, (_, role) in zip(tops, files, strict=True):
@@ -157,8 +159,13 @@ def _cloud(
 
 def _seen_by(views: list[View], entries: list[_Entry], seen: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pairs of a view and a point, of pairs that count the frames, some of which may be left out."""
-    place = {view.name: k for k, view in enumerate(views)}
-    row = np.array([place.get(entry.name, -1) for entry in entries])
+    place = {}
+    for k, view in enumerate(views):
+        place[view.name] = k
+    parts = []
+    for entry in entries:
+        parts.append(place.get(entry.name, -1))
+    row = np.array(parts)
     pairs = np.stack([row[seen[:, 0]], seen[:, 1]], 1)
     return pairs[pairs[:, 0] >= 0]
 
@@ -232,10 +239,15 @@ def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, floa
         k.append(record.number(key) or 0.0)
     if record.get("distortion_params") is not None:
         k = record.numbers("distortion_params", 6).tolist()
-    others = [record.number(key) or 0.0 for key in ("k5", "k6")]
+    others = []
+    for key in ("k5", "k6"):
+        others.append(record.number(key) or 0.0)
     model = record.text("camera_model")
     if model is None:
-        model = "OPENCV_FISHEYE" if record.get("is_fisheye") is True else "OPENCV"
+        if record.get("is_fisheye") is True:
+            model = "OPENCV_FISHEYE"
+        else:
+            model = "OPENCV"
     if model not in _CAMERA_MODELS:
         raise DataError(
             f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_CAMERA_MODELS))}; {UNDISTORT}"
@@ -260,7 +272,9 @@ def _split(
     if train is None and test is None:
         return None
     # What is listed must be there, and on one side.
-    names = {entry.name for entry in entries}
+    names = set()
+    for entry in entries:
+        names.add(entry.name)
     learned = _listed(inside, top, "train_filenames")
     held = _listed(inside, top, "test_filenames")
     for key, members in (("train_filenames", learned), ("test_filenames", held)):

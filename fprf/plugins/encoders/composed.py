@@ -37,7 +37,10 @@ class ConcatEncoder(FrozenEncoder):
         names = []
         for weight, unit, part in zip(weights, units, parts, strict=True):
             names.append(f"{weight!r}/{unit!r}*[{part.identity}]")
-        kind = "concat:" if cells == "finest" else f"concat:{cells}:"
+        if cells == "finest":
+            kind = "concat:"
+        else:
+            kind = f"concat:{cells}:"
         super().__init__(kind + "+".join(names), sum(part.channels for part in parts))
         self._cells = cells
         self.parts = nn.ModuleList(parts)
@@ -68,7 +71,10 @@ class ConcatEncoder(FrozenEncoder):
             for each in maps:
                 least.append((min(each.shape[2], size[0]), min(each.shape[3], size[1])))
             maps = [F.adaptive_avg_pool2d(each, cells) for each, cells in zip(maps, least, strict=True)]
-            return torch.cat([F.interpolate(each, size, mode="bilinear") for each in maps], dim=1)
+            parts = []
+            for each in maps:
+                parts.append(F.interpolate(each, size, mode="bilinear"))
+            return torch.cat(parts, dim=1)
         height = max(each.shape[2] for each in maps)
         width = max(each.shape[3] for each in maps)
         size = torch.Size((height, width))

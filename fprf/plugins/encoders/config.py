@@ -192,7 +192,9 @@ class Dinov2Config(EncoderConfig):
             )
 
     def needs(self) -> tuple[Need, ...]:
-        return () if self.model is None else _hub_needs(self.model)
+        if self.model is None:
+            return ()
+        return _hub_needs(self.model)
 
     def build(self) -> Encoder:
         if self.model is None:

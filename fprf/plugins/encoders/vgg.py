@@ -63,7 +63,9 @@ class VggEncoder(FrozenEncoder):
             for part in ("weight", "bias"):
                 key = f"features.{CONVOLUTIONS[name]}.{part}"
                 if key not in tensors:
-                    held = [f"relu{each}" for each in names[:index]]
+                    held = []
+                    for each in names[:index]:
+                        held.append(f"relu{each}")
                     raise WeightsError(
                         f"{source}: holds no conv{name} ({key} is missing); its layers are "
                         f"{', '.join(held) or 'none of VGG-19'}; choose one of these, or name a file that reaches further "

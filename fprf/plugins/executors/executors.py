@@ -25,7 +25,10 @@ class SerialExecutor(Executor):
 
     def map(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
         """Results in the order of the tasks; the first error stops the rest."""
-        return [function(task) for task in tasks]
+        found: list[Result] = []
+        for task in tasks:
+            found.append(function(task))
+        return found
 
 
 def resources(config: RayConfig) -> dict[str, float]:
@@ -64,7 +67,10 @@ class RayExecutor(Executor):
         remote = ray.remote(**resources(self.config))(work)
         waiting = [remote.remote(task) for task in tasks]
         try:
-            return [ray.get(reference) for reference in waiting]
+            found: list[Result] = []
+            for reference in waiting:
+                found.append(ray.get(reference))
+            return found
         except BaseException as error:
             # Ray aborts this process if it cancels a task whose completion it is just taking in
             # (ray-project/ray#54798).

@@ -60,7 +60,10 @@ class AdainStylizer(Stylizer):
                 zero = torch.zeros_like(scene.semantic_mean)
             else:
                 zero = dictionary.origin
-            centre = scene.semantic_mean if config.centred else zero
+            if config.centred:
+                centre = scene.semantic_mean
+            else:
+                centre = zero
             cosine = config.similarity == "cosine"
             if cosine:
                 queries = unit(scene.keys, centre)

@@ -210,8 +210,12 @@ def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[
     """
     if not any(origin):
         return table
-    kinds: list[tuple[str, Any]] = [(name, table.dtype[name]) for name in table.dtype.names or ()]
-    in_float64 = [(name, "<f8" if name in ("x", "y", "z") else kind) for name, kind in kinds]
+    kinds: list[tuple[str, Any]] = []
+    for name in table.dtype.names or ():
+        kinds.append((name, table.dtype[name]))
+    in_float64 = []
+    for name, kind in kinds:
+        in_float64.append((name, "<f8" if name in ("x", "y", "z") else kind))
     out = table.astype(in_float64)
     for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
         out[name] = column + of

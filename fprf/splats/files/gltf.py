@@ -113,7 +113,10 @@ class _Part(NamedTuple):
         # The quaternion product of the node's rotation and the Gaussians' own.
         a, b, c, d = quaternions(torch.from_numpy(self.rotation)[None])[0].tolist()
         product = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
-        harmonics = np.stack([_values(self.columns[name][rows]) for name in names], 1)
+        parts = []
+        for name in names:
+            parts.append(_values(self.columns[name][rows]))
+        harmonics = np.stack(parts, 1)
         if self.linear:
             harmonics = _in_other_light(harmonics, to_linear=False)
         return (
@@ -334,7 +337,9 @@ def _parts(path: Path, document: dict[str, Any], data: Data | bytearray, start: 
                 found.append(_part(path, document, primitive, columns, matrix))
     # Gaussians shown several times would multiply a small file, and have but one place for several new
     # colours.
-    colours = [part.columns[_colour_attributes()[0]] for part in found]
+    colours = []
+    for part in found:
+        colours.append(part.columns[_colour_attributes()[0]])
     colours.sort(key=lambda column: column.ctypes.data)
     if any(itertools.starmap(np.may_share_memory, itertools.pairwise(colours))):
         raise DataError(
@@ -349,14 +354,17 @@ def _shown_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Flo
     seen = set[int]()
     scene = document.get("scenes", [{"nodes": range(len(nodes))}])[document.get("scene", 0)]
     # From right up back, in which a scene is, to right down front.
-    waiting = [(index, np.diag([1.0, -1.0, -1.0, 1.0])) for index in scene.get("nodes", [])]
+    waiting = []
+    for index in scene.get("nodes", []):
+        waiting.append((index, np.diag([1.0, -1.0, -1.0, 1.0])))
     for index, above in waiting:
         if index in seen:
             raise ValueError(f"node {index} is reached twice")
         seen.add(index)
         node = nodes[index]
         matrix = above @ _matrix_of(node)
-        waiting += [(child, matrix) for child in node.get("children", [])]
+        for child in node.get("children", []):
+            waiting.append((child, matrix))
         yield node, matrix
 
 
@@ -410,7 +418,10 @@ def _colours_of_all(parts: list[_Part]) -> list[str]:
     """Attributes of harmonics, which all primitives have, of whole degrees. Raises ValueError for others."""
     if not parts:
         return []
-    names = [name for name in _colour_attributes() if name in parts[0].columns]
+    names = []
+    for name in _colour_attributes():
+        if name in parts[0].columns:
+            names.append(name)
     alike = len(names) in COUNTS
     for part in parts:
         alike = alike and {*names} == {name for name in part.columns if ":SH_" in name}

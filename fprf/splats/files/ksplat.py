@@ -65,7 +65,9 @@ class Ksplat(CaptureFormat):
             section = _Section(*numbers)
             table = section.table(path, data, number, compression, start)
             if section.number:
-                places = section.places(path, data, number, start) if compression else None
+                places = None
+                if compression:
+                    places = section.places(path, data, number, start)
                 sections.append((section.number, partial(_decoded, table, places, limits=limits)))
                 degrees.add(section.degree)
             total_read += section.number

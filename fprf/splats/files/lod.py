@@ -54,7 +54,9 @@ class StreamedSog(CaptureFormat):
             raise DataError(f"{path}: files of different degrees of harmonics; export the capture again")
         if not parts:
             raise DataError(f"{path}: holds no Gaussian")
-        sections = [(len(part[0]), partial(_some_rows, part)) for part in parts]
+        sections = []
+        for part in parts:
+            sections.append((len(part[0]), partial(_some_rows, part)))
         gaussians, shift = base.decoded(parts[0][-1].shape[1], *sections)
         return Capture(path, gaussians, antialiased, bundle(archives), _not_recoloured, shift=shift)
 
@@ -87,7 +89,10 @@ def _finest_rows(index: dict[str, Any]) -> dict[str, list[slice]]:
 
 def _check_rows(path: Path, name: str, rows: list[slice], count: int) -> None:
     """Raise DataError where leaves have more Gaussians than their file: that would multiply a small file."""
-    leaves = [each for each in rows if each.stop is not None]
+    leaves = []
+    for each in rows:
+        if each.stop is not None:
+            leaves.append(each)
     together = sum(each.stop - each.start for each in leaves)
     last = max((each.stop for each in leaves), default=0)
     most = max(together, last)

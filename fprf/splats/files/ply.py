@@ -64,7 +64,10 @@ class Ply(CaptureFormat):
         elements.
         """
         file = read_tables(path, data)
-        read = read_chunks if is_chunked(file.header) else _read_inria
+        if is_chunked(file.header):
+            read = read_chunks
+        else:
+            read = _read_inria
         capture = read(path, file.data, file.elements)
         said = _Comments.of(file.header)
         camera = _camera(file.data, file.elements)
@@ -114,7 +117,8 @@ def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
     """Rows of the INRIA file. Normals, which nobody reads and some demand, are 0."""
     means, turns, scales, logits, harmonics = base.arrays(gaussians)
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
-    names += [f"f_rest_{i}" for i in range(3 * harmonics.shape[1] - 3)]
+    for i in range(3 * harmonics.shape[1] - 3):
+        names.append(f"f_rest_{i}")
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     normals = np.zeros_like(means)
     columns = np.concatenate(
@@ -136,7 +140,9 @@ class _Comments(NamedTuple):
 
     @classmethod
     def of(cls, header: Header) -> "_Comments":
-        texts = [" ".join(words[1:]) for words in header.comments]
+        texts = []
+        for words in header.comments:
+            texts.append(" ".join(words[1:]))
         mode = ""
         vertical = ""
         for text in texts:
@@ -205,7 +211,10 @@ class _Columns(NamedTuple):
 
     @property
     def turns(self) -> list[str]:
-        return [f"rot_{i}" for i in range(4)]
+        found: list[str] = []
+        for i in range(4):
+            found.append(f"rot_{i}")
+        return found
 
 
 def _read_inria(path: Path, data: Data, elements: Mapping[str, Element]) -> Capture:
@@ -246,7 +255,9 @@ def _columns(path: Path, vertex: Element) -> _Columns:
         sizes.append("scale_2")
     bands = 1 + rest // 3
     # The constants come first, then all harmonics of a channel after those of the one before.
-    places = {name: (0, channel) for channel, name in enumerate(constants)}
+    places = {}
+    for channel, name in enumerate(constants):
+        places[name] = (0, channel)
     for i in range(rest):
         places[f"f_rest_{i}"] = (1 + i % max(bands - 1, 1), i // max(bands - 1, 1))
     columns = _Columns(places, sizes, bands, byte_colours)
@@ -278,8 +289,14 @@ def _decoded(table: NDArray[np.void], columns: _Columns) -> tuple[Floats, ...]:
     for axis, name in enumerate(columns.sizes):
         scales[:, axis] = table[name]
     # Positions may be of any type; far from 0 they lose nothing by their local origin.
-    means = np.stack([table[name] for name in "xyz"], 1)
-    turns = np.stack([table[name] for name in columns.turns], 1)
+    parts = []
+    for name in "xyz":
+        parts.append(table[name])
+    means = np.stack(parts, 1)
+    parts = []
+    for name in columns.turns:
+        parts.append(table[name])
+    turns = np.stack(parts, 1)
     return means, turns, scales, table["opacity"], harmonics
 
 
@@ -308,7 +325,9 @@ def _camera(data: Data, elements: Mapping[str, Element]) -> Cameras | None:
     for name in ("extrinsic", "intrinsic", "image_size"):
         if name in elements:
             table = elements[name].table(data)
-            columns = [table[each].astype(np.float64) for each in elements[name].names()]
+            columns = []
+            for each in elements[name].names():
+                columns.append(table[each].astype(np.float64))
             numbers[name] = np.stack(columns, 1).ravel()
     # Without a pose the camera is at the origin and looks along z.
     matrix = numbers.get("extrinsic", np.eye(4).ravel())

@@ -151,7 +151,10 @@ class _Chunks:
         harmonics = base.constants_of(rgb)
         if self.sh is not None:
             # The two outermost bytes stand for the very ends of the range.
-            raw = np.stack([self.sh[name][rows] for name in self.rest], 1)
+            parts = []
+            for name in self.rest:
+                parts.append(self.sh[name][rows])
+            raw = np.stack(parts, 1)
             share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
             bands = ((share - 0.5) * _HARMONIC_RANGE).reshape(len(raw), 3, -1).transpose(0, 2, 1)
             harmonics = np.concatenate([harmonics, bands], 1)
@@ -167,8 +170,14 @@ class _Chunks:
     def _within(self, share: Floats, rows: slice, bounds: _Bounds) -> Floats:
         """Shares [n 3] of some rows as numbers between the bounds of their chunks."""
         of = self.of[rows]
-        low = np.stack([self.chunk[name][of] for name in bounds.low], 1).astype(np.float64)
-        high = np.stack([self.chunk[name][of] for name in bounds.high], 1).astype(np.float64)
+        parts = []
+        for name in bounds.low:
+            parts.append(self.chunk[name][of])
+        low = np.stack(parts, 1).astype(np.float64)
+        parts = []
+        for name in bounds.high:
+            parts.append(self.chunk[name][of])
+        high = np.stack(parts, 1).astype(np.float64)
         return np.asarray(low * (1 - share) + high * share)
 
 

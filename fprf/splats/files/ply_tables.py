@@ -91,7 +91,11 @@ class Header(NamedTuple):
     @property
     def comments(self) -> list[list[str]]:
         """Words of the comments, with that before them."""
-        return [words for words in self.lines if words[0] in ("comment", "obj_info")]
+        found: list[list[str]] = []
+        for words in self.lines:
+            if words[0] in ("comment", "obj_info"):
+                found.append(words)
+        return found
 
     def has_property(self, name: str) -> bool:
         """Whether any element has a property of that name."""
@@ -222,7 +226,10 @@ def _elements(path: Path, data: Data, header: Header) -> dict[str, Element]:
             offset = after
             continue
         table = declared.table
-        row_bytes = _MIN_ASCII_BYTES * len(declared.kinds) if is_ascii else table.itemsize
+        if is_ascii:
+            row_bytes = _MIN_ASCII_BYTES * len(declared.kinds)
+        else:
+            row_bytes = table.itemsize
         end = offset + declared.rows * row_bytes
         if end > len(data) + is_ascii:
             raise base.short(path, len(data), end, what)
@@ -246,7 +253,10 @@ def _declared(path: Path, header: Header) -> list[_Declared]:
         names = []
         for each in properties:
             said = _kinds(each)
-            known = [types[kind] for kind in said if kind in types]
+            known = []
+            for kind in said:
+                if kind in types:
+                    known.append(types[kind])
             kinds.append(known)
             if known and len(known) == len(said):
                 names.append(each[-1])

@@ -90,7 +90,9 @@ class Sog(CaptureFormat):
         rows = _Rows(path, parts)
 
         def recolour(harmonics: Floats, changed: Bools) -> list[bytes]:
-            new = {folder + name: content for name, content in rows.recoloured(harmonics).items()}
+            new = {}
+            for name, content in rows.recoloured(harmonics).items():
+                new[folder + name] = content
             return [bundle(files | new, like=data)]
 
         gaussians, shift = base.decoded(rows.bands, (rows.count, rows.decoded))
@@ -139,7 +141,9 @@ class Sog(CaptureFormat):
         if gaussians.degree > 0:
             palette, meta["shN"] = _packed_palette(harmonics, gaussians.degree, shape)
             pictures |= palette
-        parts = {name: _webp(picture) for name, picture in pictures.items()}
+        parts = {}
+        for name, picture in pictures.items():
+            parts[name] = _webp(picture)
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
@@ -568,4 +572,7 @@ def _labels(rows: Floats) -> NDArray[np.int64]:
 def _means(rows: Floats, labels: NDArray[np.int64], count: int) -> Floats:
     """Mean row of each label; 0 where there is none."""
     inside = np.maximum(np.bincount(labels, minlength=count), 1)
-    return np.stack([np.bincount(labels, column, count) for column in rows.T], 1) / inside[:, None]
+    parts = []
+    for column in rows.T:
+        parts.append(np.bincount(labels, column, count))
+    return np.stack(parts, 1) / inside[:, None]

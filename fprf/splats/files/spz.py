@@ -93,7 +93,10 @@ class _Header(NamedTuple):
         position = 6 if self.version == 1 else 9
         turn = 4 if self.version >= 3 else 3
         rest = 3 * (COUNTS[self.degree] - 1)
-        return [self.number * each for each in (position, 1, 3, 3, turn, rest)]
+        found: list[int] = []
+        for each in (position, 1, 3, 3, turn, rest):
+            found.append(self.number * each)
+        return found
 
 
 _TINT_STREAM = 2
@@ -120,12 +123,16 @@ class _Container(NamedTuple):
     @property
     def axes_records(self) -> bytes:
         """Extensions where the header announces any."""
-        return self.extensions if self.header.flags & _EXTENSIONS_FLAG else b""
+        if self.header.flags & _EXTENSIONS_FLAG:
+            return self.extensions
+        return b""
 
     def with_streams(self, new: Mapping[int, bytes]) -> list[bytes]:
         """The file with other bytes in some streams; what is packed alone stays as it is packed."""
         if self.header.version < 4:
-            parts = [new.get(number, stream) for number, stream in enumerate(self.streams)]
+            parts = []
+            for number, stream in enumerate(self.streams):
+                parts.append(new.get(number, stream))
             whole = b"".join([self.unpacked[: self.header.size], *parts, self.extensions])
             if self.trailer is None:
                 return [whole]
@@ -191,7 +198,10 @@ class _Rows:
             w = np.sqrt(np.maximum(0, 1 - (three**2).sum(1, keepdims=True)))
             return np.concatenate([w, three], 1)
         word = self.turns.view("<u4")[rows]
-        parts = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1).astype(np.int64)
+        pieces = []
+        for shift in (20, 10, 0):
+            pieces.append(word >> shift & 1023)
+        parts = np.stack(pieces, 1).astype(np.int64)
         sizes = (parts & 511) / 511 * np.where(parts >> 9, -1.0, 1.0)
         found = base.three_to_four((word >> 30).astype(np.int64), sizes)
         quaternions = np.empty_like(found)
