@@ -49,10 +49,15 @@ def _use_one_thread() -> None:
 
 
 @pytest.fixture(scope="session")
-def _world(tmp_path_factory: pytest.TempPathFactory) -> Iterator["World"]:
+def one_thread() -> None:
+    """For fixtures of a session, which come before those of a test: sums depend on the threads."""
+    _use_one_thread()
+
+
+@pytest.fixture(scope="session")
+def _world(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Iterator["World"]:
     from tiny_world import make_world  # imports the engine, which few tests need
 
-    _use_one_thread()  # fixtures of a session come before those of a test, and sums depend on the threads
     folder = tmp_path_factory.mktemp("world")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))

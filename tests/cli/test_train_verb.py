@@ -101,7 +101,9 @@ def test_a_size_that_is_found_stays_with_the_run(
 ) -> None:
     """As a number in config.json; the same command goes on with it, whatever would be found today."""
     found = iter((2, 3))
-    monkeypatch.setattr(TrainConfig, "find_downscale", lambda config, scene, device: next(found))
+    monkeypatch.setattr(
+        TrainConfig, "planned", lambda config, scene, device: replace(config, downscale=next(found))
+    )
     for steps in ("2", "3"):
         args = [*flags(world, tmp_path / "run"), "--steps", steps]
         assert cli.main(["train", "fprf-lite", *args[:4], *args[6:]]) == 0

@@ -10,7 +10,7 @@ from fprf.training.driver import train
 
 
 @pytest.fixture(scope="session")
-def _block_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BlockWorld]:
+def _block_world(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Iterator[BlockWorld]:
     folder = tmp_path_factory.mktemp("blocks")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
@@ -25,7 +25,7 @@ def block_world(_block_world: BlockWorld, monkeypatch: pytest.MonkeyPatch) -> Bl
 
 
 @pytest.fixture(scope="session")
-def cell_world(tmp_path_factory: pytest.TempPathFactory) -> TaskWorld:
+def cell_world(tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> TaskWorld:
     """The town in two cells."""
     folder = tmp_path_factory.mktemp("cells")
     write_town(folder / "town", seed=0, palette="day", views=10, width=96, height=72)
