@@ -106,6 +106,9 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
     with lock_folder(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         # An existing run goes on with its own config and images; what was cut short there is removed.
+        config = _going_on(run, config)
+        if all(getattr(config, name) is not None for name in config.open):
+            _check_same(run, config)  # before the scene is read, which may be elsewhere now
         whole = read_whole_scene(config)
         config = _sized(run, config, display, whole)
         _check_same(run, config)
@@ -409,10 +412,24 @@ def _check_needs(config: RunConfig, method: str, display: Display) -> None:
     raise UsageError(f"fprf train {method}: {needs[0].what}: {needs[0].remedy}")
 
 
-def _sized(run: Run, config: RunConfig, display: Display, whole: ParsedScene) -> RunConfig:
-    """The config with all decided that it leaves open, which an existing run has decided already; `whole` is the
-    scene at its own size.
+def _going_on(run: Run, config: RunConfig) -> RunConfig:
+    """The config with what it leaves open as an existing run has decided it.
+
+    Else a run would change its size with the machine or the minutes.
     """
+    if not run.exists:
+        return config
+    old = run.load_config()[0]
+    decided = {}
+    for name in config.open:
+        value = getattr(old, name, None)
+        if getattr(config, name) is None and value is not None:
+            decided[name] = value
+    return replace(config, **decided)
+
+
+def _sized(run: Run, config: RunConfig, display: Display, whole: ParsedScene) -> RunConfig:
+    """The config with all decided that it still leaves open; `whole` is the scene at its own size."""
     if config.downscale is not None and config.downscale > 1 and not run.exists:
         width, height = scene_at_size(config, whole).cameras.size[0].tolist()
         if min(width, height) < _MIN_REDUCED_PIXELS:
@@ -420,14 +437,6 @@ def _sized(run: Run, config: RunConfig, display: Display, whole: ParsedScene) ->
                 f"warning: {width}x{height} pixels are few: --downscale {config.downscale:g} counts from the images as they "
                 "are delivered, also in a folder images_N; leave it out"
             )
-    # Else a run would change its size with the machine or the minutes.
-    if run.exists:
-        old = run.load_config()[0]
-        decided = {}
-        for name in config.open:
-            if getattr(config, name) is None:
-                decided[name] = getattr(old, name, None)
-        config = replace(config, **{name: value for name, value in decided.items() if value is not None})
     if any(getattr(config, name) is None for name in config.open):
         config = planned(config, whole)
         sizes = whole.cameras.scaled(config.downscale or 1).size

@@ -26,7 +26,7 @@ import torch
 from fprf import memory
 from fprf.cli import main as cli
 from fprf.training import style_pass, views
-from fprf.training.loading import load_run
+from fprf.training.field_scene import load_run
 
 def limit(room):
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
