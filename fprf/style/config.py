@@ -225,7 +225,9 @@ class StyleConfig:
             parse_strength("region_strength", text)
         for name in ("weights", "masks"):
             given = len(getattr(self, name))
-            one_folder = name == "masks" and given == 1 and self.masks[0] != NO_MASK  # which `with_folders` sees
+            one_folder = (
+                name == "masks" and given == 1 and self.masks[0] != NO_MASK
+            )  # which `with_folders` sees
             if given and self.references and given != len(self.references) and not one_folder:
                 raise ConfigError(
                     f"{name}: {given} {name} for {len(self.references)} references; give one each, or none"
