@@ -243,9 +243,11 @@ def test_scripts_are_there(command: Command) -> None:
 
 def test_the_python_of_pages_runs_and_the_plug_in_of_the_readme_keeps_its_contract() -> None:
     for page in ("docs/plugins.md", "README.md"):
-        [block] = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
-        defined: dict[str, Any] = {"__name__": "page"}
-        exec(compile(block, page, "exec"), defined)
+        for block in re.findall(
+            r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE
+        ):
+            defined: dict[str, Any] = {"__name__": "page"}
+            exec(compile(block, page, "exec"), defined)
     check_encoder(defined["ContrastConfig"]())
 
 
