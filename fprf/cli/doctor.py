@@ -369,7 +369,7 @@ def capture_file(path: Path) -> Iterator[Finding]:
 
 
 def photographs_without_poses(data: Path, photographs: "Photographs") -> Iterator[Finding]:
-    """What `fprf process` will take of a folder, and what it will leave out."""
+    """Tell what `fprf process` will take of a folder, and what it will leave out."""
     from ..datamanagers.photograph_files import COPIES, equal_files, equal_pictures, left_out_note, shown_name
 
     files = photographs.files
@@ -391,7 +391,7 @@ def photographs_without_poses(data: Path, photographs: "Photographs") -> Iterato
 
 
 def lenses_of(data: Path, files: Sequence[Path]) -> Iterator[Finding]:
-    """What the photographs of a folder say of their lenses."""
+    """Tell what the photographs of a folder say of their lenses."""
     from ..datamanagers.image_files import read_header
     from ..reconstruction.images import read_encoder, read_lens
     from ..reconstruction.lenses import unsaid_sentence
@@ -411,7 +411,7 @@ def lenses_of(data: Path, files: Sequence[Path]) -> Iterator[Finding]:
 
 
 def video_file(path: Path) -> Iterator[Finding]:
-    """How much of a video can be read, and what `fprf process` will make of its colours and pixels. Raises
+    """Tell how much of a video can be read, and what becomes of its colours and pixels. Raises
     DataError where it cannot be opened.
     """
     from ..io.video_reader import read_video

@@ -58,7 +58,7 @@ class Flag(NamedTuple):
 
     @property
     def most(self) -> float:
-        """How many values it takes, at most."""
+        """Number of values that it takes, at most."""
         most = 1.0
         for kind in self.kinds:
             args = get_args(kind)
@@ -123,7 +123,7 @@ _WRITTEN = ("output", "page", "cache", "tensorboard")
 
 
 def read_paths(config: Any) -> tuple[Path, ...]:
-    """All files and folders that a config names to be read."""
+    """Files and folders that a config names to be read."""
     paths: list[Path] = []
     for flag in flags_of(config).values():
         name = flag.path.rpartition(".")[2]

@@ -133,7 +133,7 @@ def _reconstruct(config: ProcessConfig, place: "SceneFolder", display: Display) 
 
 
 def _notes(state: "State", *steps: str) -> list[str]:
-    """What some steps have decided."""
+    """Decisions that some steps have made."""
     notes = []
     for step in steps:
         notes += state.notes.get(step, [])

@@ -106,7 +106,7 @@ class _Restyled(NamedTuple):
 
 
 class _Written(NamedTuple):
-    """What came of writing all captures."""
+    """Outcome of writing the captures."""
 
     left: Counter[str]
     """Gaussians that cannot be drawn, by what is wrong with them and what became of them."""
