@@ -225,9 +225,8 @@ class StyleConfig:
             parse_strength("region_strength", text)
         for name in ("weights", "masks"):
             given = len(getattr(self, name))
-            one_folder = (
-                name == "masks" and given == 1 and self.masks[0] != NO_MASK
-            )  # which `with_folders` sees
+            # A folder of masks, which `with_folders` replaces by what it holds.
+            one_folder = name == "masks" and given == 1 and self.masks[0] != NO_MASK
             if given and self.references and given != len(self.references) and not one_folder:
                 raise ConfigError(
                     f"{name}: {given} {name} for {len(self.references)} references; give one each, or none"

@@ -1,12 +1,12 @@
 """Hashes of a run's images, so that another start does not go on with others (images.json)."""
 
-import hashlib
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from ..datamanagers.photograph_files import file_digest
 from ..datamanagers.scene import ParsedScene
-from ..errors import DataError, UsageError
+from ..errors import UsageError
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
 from ..plugins.codec import from_json
@@ -24,19 +24,9 @@ _MAX_LISTED = 3
 
 def image_hashes(scene: ParsedScene) -> dict[str, str]:
     """SHA-256 of each image's file, by the view's name. Raises DataError where one cannot be read."""
-
-    def of(path: Path) -> str:
-        try:
-            with path.open("rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            raise DataError(
-                f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
-            ) from error
-
     # Hashing waits for the disk, so files are read side by side.
     with ThreadPoolExecutor() as pool:
-        return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
+        return dict(zip(view_names(scene.paths), pool.map(file_digest, scene.paths), strict=True))
 
 
 def save_image_hashes(root: Path, hashes: Mapping[str, str]) -> None:
