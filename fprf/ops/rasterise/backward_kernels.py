@@ -1,5 +1,5 @@
-"""Compiled backward pass of the rasteriser of 3D Gaussians; blocks, splats and entries are those of
-`forward_kernels`.
+"""Compiled backward pass of the rasteriser of 3D Gaussians; blocks are those of
+`layout`, splats and entries those of `tile_kernels`.
 
 Of every entry SUMS floats are kept: the sums over its pixels of p, p dx, p dx^2, p dy, p dx dy, p dy^2, where
 p is dL / d ln alpha, then of weight times the gradient of each channel. Slots of one Gaussian lie together,
@@ -32,11 +32,8 @@ from ..threads import on_threads, take
 from . import ADAM_DECAYS, ADAM_EPSILON, BLUR, MAX_ALPHA, MAX_SQUARE_PIXELS
 from .forward_kernels import (
     CHUNK,
-    SIDE,
-    SLOTS,
     TILE,
     Channels,
-    Tiles,
     alpha_of,
     axes,
     block_places,
@@ -47,6 +44,7 @@ from .forward_kernels import (
     open_blocks,
 )
 from .layout import BLOCKS, FIXED, Floats, basis, colour, direction, direction_slopes, jit
+from .tile_kernels import SIDE, SLOTS, Tiles
 
 SUMS = LANES
 """Floats that are kept of an entry: a vector."""

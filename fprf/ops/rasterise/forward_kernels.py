@@ -4,31 +4,22 @@ their bridge.
 Blocks     Parameters of LANES Gaussians, a row each (`layout`).
 Camera     25 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
            the tangents (left right top bottom) 19-22, near 23, and 1 for anti-aliasing 24.
-Splats     SLOTS numbers a Gaussian after projection: x y 0-1, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D 2-5, red
-           green blue 6-8, depth 9, half width and height of the ellipse where alpha is 1/255 10-11, then what
-           cuts it into columns 12-15: xy/yy, det/yy, 1/yy, and dy of its right end. A half width of no more
-           than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
-Tiles      16 x 16 pixels in 16 blocks of 4 x 4, row by row; such a block of pixels is a vector.
-Entries    A Gaussian in a tile, with a bit for each block of pixels that it may reach.
+Splats, tiles and entries are those of `tile_kernels`.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
 import math
-from typing import Annotated, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..simd import (
     LANES,
-    added_in_fours,
     as_float,
     exp2,
-    floor,
     greater_bits,
     lanes,
-    largest,
-    least,
     load,
     log2,
     lowest_bit,
@@ -46,24 +37,14 @@ from ..simd import (
 from ..threads import on_threads, take
 from . import BLUR, MAX_ALPHA, MAX_SQUARE_PIXELS, MIN_ALPHA
 from .layout import BLOCKS, FIXED, MARK, MIN_SQUARED_NORM, Floats, basis, colour, direction, jit
+from .tile_kernels import BEHIND, FAINT, INVALID, OUTSIDE, SIDE, SLOTS, Tiles, tiles_of
 
-_Ints = np.ndarray[Any, np.dtype[np.int32]]
-SLOTS = 16
-"""Numbers of a splat: a vector, though 16 are used."""
-SIDE = 16
-"""Pixels of a tile's side: 16 blocks of 4 x 4, one bit of an integer each."""
 STOP = 1e-3
 """Blocks of a tile through which no more than this share of light passes are left alone: an error of at most
 a quarter of a step of 8 bits.
 """
 CHUNK = 32
 """Entries of a tile between looks at which of its blocks light still passes; by eye."""
-# Why there is nothing to draw: places in `Tiles.skipped`.
-FAINT = 0  # alpha stays below MIN_ALPHA
-BEHIND = 1  # the camera
-OUTSIDE = 2  # the image
-INVALID = 3  # not finite, or too large
-
 _f = np.float32
 _LOG2E = 1 / math.log(2)
 """e^x = 2^(x _LOG2E)."""
@@ -71,8 +52,6 @@ _LN2 = math.log(2)
 """ln x = _LN2 log2 x."""
 LOG_MIN = _f(math.log2(MIN_ALPHA))
 """log2 alpha that counts as 0."""
-_ZERO = _f(0)  # a float32, as what it is compared with
-_VECTOR = LANES
 
 
 def axes(blocks, at, view):
@@ -200,196 +179,6 @@ def _project(bands):
 _PROJECT = {bands: _project(bands) for bands in (1, 4, 9, 16)}
 
 
-class Tiles(NamedTuple):
-    """Gaussians as a camera sees them, and the entries of those that are seen: sorted by tile, then by depth.
-    int32.
-
-    Slots number entries Gaussian by Gaussian. Depths closer than 2^-20 of what is seen keep their order.
-    """
-
-    splats: Floats
-    total: int
-    """Gaussians, seen or not."""
-    width: int
-    height: int
-    start: Annotated[_Ints, "tiles+1"]
-    """Start of each tile."""
-    ids: _Ints
-    """Gaussian of each entry."""
-    slots: _Ints
-    blocks: _Ints
-    """Bits of the blocks of pixels that each entry may reach."""
-    first_slot: Annotated[_Ints, "N+1+LANES"]
-    """Start of the slots of each Gaussian."""
-    skipped: _Ints
-    """Counts of Gaussians that were left out as FAINT, BEHIND, OUTSIDE, INVALID."""
-
-
-@traced
-def _bands(splats_in, o, row, height, width):
-    """First and last column of blocks that a Gaussian may reach in 16 rows of blocks, 1e9 and -1 where there
-    is none.
-
-    Between the pixel centres of a row of blocks the ellipse is widest at its right and left end or where
-    these are cut off.
-    """
-    # Rows of pixels of each row of blocks, cut to the ellipse, relative to its middle.
-    mx = splats_in[o] - 0.5
-    my = splats_in[o + 1] - 0.5
-    rx = splats_in[o + 10]
-    ry = splats_in[o + 11]
-    slope = splats_in[o + 12]
-    part = splats_in[o + 13]
-    inverse_yy = splats_in[o + 14]
-    right = splats_in[o + 15]
-    y = as_float(row) * 4 + lanes(mx, range(0, 4 * LANES, 4))
-    above = maximum(y, maximum(-floor(ry - my), 0)) - my
-    below = minimum(y + 3, minimum(floor(my + ry), as_float(height) - 1)) - my
-    # Where the ellipse is widest between them, and how far it reaches there.
-    end = minimum(maximum(right, above), below)
-    begin = minimum(maximum(-right, above), below)
-    reach = ry * ry * inverse_yy
-    far = mx + slope * end + square_root(maximum(part * (reach - end * end * inverse_yy), 0))
-    near = mx + slope * begin - square_root(maximum(part * (reach - begin * begin * inverse_yy), 0))
-    first = maximum(-floor(-maximum(near, mx - rx)), 0)
-    last = minimum(floor(minimum(far, mx + rx)), as_float(width) - 1)
-    reached = where_greater(above, below, splat(mx, 0), where_greater(first, last, splat(mx, 0), 1))
-    return where_greater(reached, 0, floor(first * 0.25), 1e9), where_greater(
-        reached, 0, floor(last * 0.25), -1
-    )
-
-
-@traced
-def _masks(first, last, column, memory):
-    """Of the four tiles in a column, the bits of the blocks that a Gaussian reaches, to memory[0, 4, 8,
-    12].
-    """
-    c = as_float(column) * 4
-    bits = splat(first, 0)
-    for k in range(4):
-        bits = bits + where_greater(first, c + k, splat(c, 0), where_greater(c + k, last, splat(c, 0), 2**k))
-    store(memory, 0, added_in_fours(bits * lanes(first, [16 ** (lane % 4) for lane in range(LANES)])))
-
-
-_ENTRIES_PER_GAUSSIAN = 4
-"""Tiles that a Gaussian reaches, about, in the first try; by eye."""
-_SPARE_ENTRIES = 1024
-"""Room beside it for views of few Gaussians; by eye."""
-
-
-@jit
-def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped):
-    """Fill what has room; return how many entries and Gaussians there are, and the range of the keys."""
-    across = (width + SIDE - 1) // SIDE
-    visible = 0
-    entries = 0
-    room = len(tile_of)
-    low = 0x7FFFFFFF
-    high = 0
-    memory = stack(_VECTOR)
-    for i in range(count):
-        first_slot[i] = entries
-        o = i * SLOTS
-        if not splats_in[o + 10] > _ZERO:
-            skipped[int(-splats_in[o + 10])] += 1
-            continue
-        # Four rows of tiles at a time: the range of blocks in each row, then the tiles of each column.
-        before = entries
-        top = splats_in[o + 1] - splats_in[o + 11]
-        bottom = splats_in[o + 1] + splats_in[o + 11]
-        r0 = int(top) // SIDE if top > _ZERO else 0
-        r1 = int(bottom) // SIDE if bottom < height else (height - 1) // SIDE
-        for r in range(r0, r1 + 1, 4):
-            first, last = _bands(splats_in, o, 4 * r, height, width)
-            begin = least(first)
-            end = largest(last)
-            if begin > end:
-                continue
-            for c in range(int(begin) // 4, int(end) // 4 + 1):
-                _masks(first, last, c, memory)
-                for k in range(4):
-                    mask = int(memory[4 * k])
-                    if mask != 0:
-                        if entries < room:
-                            tile = (r + k) * across + c
-                            tile_of[entries] = tile
-                            blocks_of[entries] = mask
-                            start[tile + 1] += 1
-                        entries += 1
-        if entries > before:
-            k = bits[o + 9]  # positive floats sort as their bits do
-            low = k if k < low else low
-            high = k if k > high else high
-            seen[visible] = i
-            key[visible] = k
-            visible += 1
-        else:
-            skipped[OUTSIDE] += 1
-    for i in range(count, len(first_slot)):
-        first_slot[i] = entries
-    return entries, visible, low, high
-
-
-@jit
-def _sort(
-    seen,
-    key,
-    visible,
-    low,
-    high,
-    digits,
-    other,
-    other_key,
-    first_slot,
-    tile_of,
-    blocks_of,
-    start,
-    fill,
-    ids,
-    slots,
-    blocks,
-):
-    """Radix sort of the Gaussians by 22 bits of the depth's range, 11 at a time; then each one's entries to
-    their tiles.
-    """
-    shift = 0
-    while (high - low) >> shift >= 1 << 22:
-        shift += 1
-    # How often each digit occurs gives where those of each begin.
-    for q in range(visible):
-        k = (key[q] - low) >> shift
-        key[q] = k
-        digits[0, (k & 2047) + 1] += 1
-        digits[1, (k >> 11) + 1] += 1
-    for c in range(2048):
-        digits[0, c + 1] += digits[0, c]
-        digits[1, c + 1] += digits[1, c]
-    # By the low digit, then by the high one, which keeps the order of equals.
-    for q in range(visible):
-        k = key[q]
-        d = digits[0, k & 2047]
-        digits[0, k & 2047] = d + 1
-        other[d] = seen[q]
-        other_key[d] = k >> 11
-    for q in range(visible):
-        k = other_key[q]
-        d = digits[1, k]
-        digits[1, k] = d + 1
-        seen[d] = other[q]
-    # Entries to their tiles, front to back.
-    for tile in range(len(start) - 1):
-        start[tile + 1] += start[tile]
-        fill[tile] = start[tile]
-    for q in range(visible):
-        i = seen[q]
-        for slot in range(first_slot[i], first_slot[i + 1]):
-            at = fill[tile_of[slot]]
-            fill[tile_of[slot]] = at + 1
-            ids[at] = i
-            slots[at] = slot
-            blocks[at] = blocks_of[slot]
-
-
 def see(
     blocks: Floats, count: int, bands: int, view: Floats, width: int, height: int, splats: Floats
 ) -> Tiles:
@@ -397,43 +186,7 @@ def see(
     of them.
     """
     on_threads(_PROJECT[bands], blocks, count, view, width, height, splats)
-    tiles = ((width + SIDE - 1) // SIDE) * ((height + SIDE - 1) // SIDE)
-    room = _ENTRIES_PER_GAUSSIAN * count + _SPARE_ENTRIES
-    first_slot = np.empty(count + 1 + LANES, np.int32)
-    (seen, key, *others) = np.empty((4, count), np.int32)
-    while True:
-        # How many entries there are is known when all have been found: where room is too small, once more
-        # with enough.
-        tile_of, blocks_of = np.empty((2, room), np.int32)
-        start = np.zeros(tiles + 1, np.int32)
-        skipped = np.zeros(4, np.int32)
-        entries, visible, low, high = _find(
-            splats, splats.view(np.int32), count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped
-        )  # fmt: skip
-        if entries <= room:
-            break
-        room = entries
-    digits = np.zeros((2, 2049), np.int32)
-    fill = np.empty(tiles, np.int32)
-    ids, slots, bits = np.empty((3, entries), np.int32)
-    _sort(
-        seen,
-        key,
-        visible,
-        low,
-        high,
-        digits,
-        *others,
-        first_slot,
-        tile_of,
-        blocks_of,
-        start,
-        fill,
-        ids,
-        slots,
-        bits,
-    )
-    return Tiles(splats, count, width, height, start, ids, slots, bits, first_slot, skipped)
+    return tiles_of(splats, count, width, height)
 
 
 TILE = SIDE * SIDE

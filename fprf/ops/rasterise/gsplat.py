@@ -19,9 +19,9 @@ from torch import Tensor
 from ..photometric import SSIM_C1, SSIM_C2, WINDOW, WINDOW_SIGMA
 from ..simd import LANES
 from . import ADAM_DECAYS, ADAM_EPSILON, BLUR, MAX_COORDINATE, MAX_LOG
-from .forward_kernels import SIDE
 from .layout import FIXED
 from .reference import Pinhole
+from .tile_kernels import SIDE
 from .training import (
     HARMONICS,
     LOG_SCALES,

@@ -283,6 +283,7 @@ def _view(
     from ..simd import LANES, aligned
     from . import forward_kernels as kernels
     from .layout import FIXED, pack
+    from .tile_kernels import SLOTS
     from .training import camera_array
 
     # The kernels read blocks of LANES Gaussians, property by property; the last block is padded.
@@ -290,7 +291,7 @@ def _view(
     seen = camera_array(camera, antialiased)
     whole = -(-len(means) // LANES) * LANES
     blocks = aligned(whole * (FIXED + 3 * bands))
-    splats = aligned(whole * kernels.SLOTS)
+    splats = aligned(whole * SLOTS)
     pack(
         *(x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics)),
         blocks,

@@ -26,8 +26,8 @@ from ..threads import sources
 from . import TANGENT_MARGIN
 from . import backward_kernels as backward
 from . import forward_kernels as forward
-from .forward_kernels import SIDE, SLOTS
 from .layout import FIXED
+from .tile_kernels import SIDE, SLOTS, Tiles
 
 if TYPE_CHECKING:  # it imports torch, which compilation need not wait for
     from .gsplat import Photograph
@@ -308,9 +308,7 @@ class TrainableGaussians:
         backward.lift_values(tiles, backward.lift(tiles, 8, pixels), sums.reshape(-1), 8, 0, 8, skipped=0)
         return sums[:, :3]
 
-    def _render(
-        self, target: Target, background: tuple[float, float, float]
-    ) -> tuple[forward.Tiles, Floats, Floats]:
+    def _render(self, target: Target, background: tuple[float, float, float]) -> tuple[Tiles, Floats, Floats]:
         """The Gaussians that a view sees, its planes of colours and its transmittance."""
         tiles = forward.see(
             self._blocks, self.count, self.bands, target.camera, target.width, target.height, self._splats
@@ -389,7 +387,7 @@ def _compile(bands: int, part: str) -> None:
     else:
         slots = np.zeros(LANES + LANES + 1, np.int32)
         none = np.zeros(0, np.int32)
-        tiles = forward.Tiles(splats, LANES, SIDE, SIDE, np.zeros(2, np.int32), none, none, none, slots, none)
+        tiles = Tiles(splats, LANES, SIDE, SIDE, np.zeros(2, np.int32), none, none, none, slots, none)
         slope = photometric.loss(planes, planes, photometric.blurred(planes, SIDE, SIDE), SIDE, SIDE, 0.2)[2]
         sums = backward.composite_back(tiles, colours, planes, left, slope, left)
         backward.adam(
