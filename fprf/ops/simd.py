@@ -302,6 +302,17 @@ def store(array, at, value):
     array.build.store(value, array.build.bitcast(array.at(at), value.type.as_pointer()), align=4)
 
 
+@traced
+def prefetch(array, at):
+    """Ask for the line of the cache that holds array[at], which need not exist."""
+    build = array.build
+    byte = ir.IntType(8).as_pointer()
+    kind = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
+    function = cgutils.get_or_insert_function(build.module, kind, "llvm.prefetch.p0")
+    # To read, into the first-level cache, as data.
+    build.call(function, [build.bitcast(array.at(at), byte), *(ir.Constant(_INT, k) for k in (0, 3, 1))])
+
+
 def repeat(count, start, step, by=1):
     """A loop of the compiled code: vectors = step(k, vectors) from `start` on, for k = 0, by, 2 by, ... below
     `count`.

@@ -18,6 +18,7 @@ from ..simd import (
     aligned,
     load,
     lowest_bit,
+    prefetch,
     splat,
     square_root,
     stack,
@@ -31,6 +32,7 @@ from ..simd import (
 from ..threads import on_threads, take
 from . import ADAM_DECAYS, ADAM_EPSILON, BLUR, MAX_ALPHA, MAX_SQUARE_PIXELS
 from .forward_kernels import (
+    AHEAD,
     CHUNK,
     TILE,
     Channels,
@@ -158,6 +160,7 @@ def _composite_back(channels, geometry):
             while k < end and unsaturated != 0:
                 stop = min(k + CHUNK, end)
                 for q in range(k, stop):
+                    prefetch(splats_in, ids[min(q + AHEAD, end - 1)] * SLOTS)
                     todo = blocks[q] & unsaturated
                     summed = _nothing(memory, count)
                     if todo != 0:
@@ -209,18 +212,24 @@ def _summed(kernel: Any, tiles: Tiles, channels: Channels, *planes: Floats) -> F
     return sums
 
 
+@traced
+def _add(memory, at, found, slot):
+    store(memory, at, load(memory, at) + load(found, slot))
+
+
 @jit
 def _lift_values(counters, found, first_slot, count, out, stride, offset, channels, skipped):
+    memory = stack(SUMS)
     while True:
         begin = take(counters, 0) * BLOCKS * LANES
         if begin >= count:
             break
         for i in range(begin, min(count, begin + BLOCKS * LANES)):
+            store(memory, 0, 0)
+            for slot in range(first_slot[i], first_slot[i + 1]):
+                _add(memory, 0, found, slot * SUMS)
             for c in range(channels):
-                total = np.float32(0)
-                for slot in range(first_slot[i], first_slot[i + 1]):
-                    total += found[slot * SUMS + skipped + c]
-                out[i * stride + offset + c] = total
+                out[i * stride + offset + c] = memory[skipped + c]
 
 
 def lift_values(
@@ -237,11 +246,6 @@ def lift_values(
     others.
     """
     on_threads(_lift_values, found, tiles.first_slot, tiles.total, out, stride, offset, channels, skipped)
-
-
-@traced
-def _add(memory, at, found, slot):
-    store(memory, at, load(memory, at) + load(found, slot))
 
 
 def _block_gradient(blocks, at, bands, view, summed):

@@ -179,7 +179,7 @@ def _find(
                     continue
                 for c in range(int(begin) // 4, int(end) // 4 + 1):
                     _masks(first, last, c, memory)
-                    for k in range(4):
+                    for k in range(min(4, r1 + 1 - r)):
                         mask = int(memory[4 * k])
                         if mask != 0:
                             if entries < room:
