@@ -454,7 +454,7 @@ def swapped(blocks):
 def added_in_fours(x):
     """The sum of four neighbouring lanes, in each of them."""
     for step in (1, 2):
-        x = x + _picked(x, x, [lane ^ step for lane in range(LANES)])
+        x = x + _picked(x, x, [lane ^ step for lane in range(x.lanes)])
     return x
 
 

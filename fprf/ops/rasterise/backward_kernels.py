@@ -188,10 +188,19 @@ _LIFT = {channels: _composite_back(channels, 0) for channels in (8, SUMS)}
 
 
 def composite_back(
-    tiles: Tiles, channels: Channels, out: Floats, left: Floats, grad: Floats, grad_left: Floats
+    tiles: Tiles,
+    channels: Channels,
+    out: Floats,
+    left: Floats,
+    grad: Floats,
+    grad_left: Floats,
+    sums: Floats | None = None,
 ) -> Floats:
-    """SUMS of each slot, from the planes of `composite` and their gradients, both padded to whole tiles."""
-    return _summed(_COMPOSITE_BACK[channels.number], tiles, channels, out, left, grad, grad_left)
+    """SUMS of each slot, from the planes of `composite` and their gradients, both padded to whole tiles; in
+    `sums`, where room of at least `sums_of` floats is given.
+    """
+    kernel = _COMPOSITE_BACK[channels.number]
+    return _summed(kernel, tiles, channels, sums, out, left, grad, grad_left)
 
 
 def lift(tiles: Tiles, count: int, pixels: Floats) -> Floats:
@@ -200,11 +209,16 @@ def lift(tiles: Tiles, count: int, pixels: Floats) -> Floats:
     """
     nothing = np.empty(0, np.float32)
     channels = Channels(count, tiles.splats, SLOTS, 0)
-    return _summed(_LIFT[count], tiles, channels, nothing, nothing, pixels, nothing)
+    return _summed(_LIFT[count], tiles, channels, None, nothing, nothing, pixels, nothing)
 
 
-def _summed(kernel: Any, tiles: Tiles, channels: Channels, *planes: Floats) -> Floats:
-    sums = aligned((len(tiles.ids) + 1) * SUMS)
+def sums_of(tiles: Tiles) -> int:
+    """Floats of the sums of all slots, with a spare one."""
+    return (len(tiles.ids) + 1) * SUMS
+
+
+def _summed(kernel: Any, tiles: Tiles, channels: Channels, room: Floats | None, *planes: Floats) -> Floats:
+    sums = aligned(sums_of(tiles)) if room is None else room
     on_threads(
         kernel, tiles.start, tiles.ids, tiles.slots, tiles.blocks, tiles.splats,
         channels.values, channels.stride, channels.first, tiles.width, tiles.height, *planes, sums,
@@ -362,7 +376,7 @@ def _block_gradient(blocks, at, bands, view, summed):
 
 
 @traced
-def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera):
+def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera, to):
     at = start * (FIXED + 3 * bands)
     # Adam, whose second moment is weighted by how often a Gaussian was seen.
     w = load(weight, start)
@@ -371,7 +385,7 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
     rows, of_view = _block_gradient(blocks, at, bands, view, [*summed, 0])
     for row, g in enumerate(of_view):
-        store(of_camera, start * CAMERA + row * LANES, g)
+        store(of_camera, to + row * LANES, load(of_camera, to + row * LANES) + g)
     for row, g in enumerate(rows):
         o = at + row * LANES
         m = load(first, o)
@@ -430,7 +444,9 @@ def _adam(bands):
             for start in range(begin, min(count, begin + BLOCKS * LANES), LANES):
                 if first_slot[start + LANES] > first_slot[start]:
                     _add_block(found, first_slot, start, memory)
-                    _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera)
+                    _learn_block(
+                        blocks, first, second, weight, start, bands, view, memory, rates, of_camera, begin // BLOCKS * CAMERA
+                    )  # fmt: skip
 
     return adam
 
@@ -465,7 +481,8 @@ def adam(
     the first time moves as it would have in the first step. The first moment is not corrected, so the rates
     rise over a Gaussian's first ten steps.
     """
-    of_camera = np.zeros((-(-tiles.total // LANES), CAMERA, LANES), np.float32)
+    # Of the Gaussians that a thread takes at a time, so that threads do not change the order of the sum.
+    of_camera = np.zeros((-(-tiles.total // (BLOCKS * LANES)), CAMERA, LANES), np.float32)
     on_threads(
         _ADAM[bands],
         blocks,

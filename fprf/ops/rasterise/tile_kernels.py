@@ -28,6 +28,7 @@ from ..simd import (
     least,
     maximum,
     minimum,
+    narrow,
     splat,
     square_root,
     stack,
@@ -94,25 +95,22 @@ class Tiles(NamedTuple):
 
 
 @traced
-def _bands(splats_in, o, row, height, width):
-    """First and last column of blocks that a Gaussian may reach in 16 rows of blocks, 1e9 and -1 where there
-    is none.
+def _bands(splats_in, o, row, height, width, rows):
+    """First and last column of blocks that a Gaussian may reach in so many rows of blocks, 4 or LANES; 1e9 and
+    -1 where there is none.
 
     Between the pixel centres of a row of blocks the ellipse is widest at its right and left end or where
     these are cut off.
     """
     # Rows of pixels of each row of blocks, cut to the ellipse, relative to its middle.
-    mx = splats_in[o] - 0.5
-    my = splats_in[o + 1] - 0.5
-    rx = splats_in[o + 10]
-    ry = splats_in[o + 11]
-    slope = splats_in[o + 12]
-    part = splats_in[o + 13]
-    inverse_yy = splats_in[o + 14]
-    right = splats_in[o + 15]
-    y = as_float(row) * 4 + lanes(mx, range(0, 4 * LANES, 4))
+    mx, my, rx, ry, slope, part, inverse_yy, right = (
+        narrow(splats_in[o + k], rows) for k in (0, 1, 10, 11, 12, 13, 14, 15)
+    )
+    mx = mx - 0.5
+    my = my - 0.5
+    y = narrow(as_float(row) * 4 + lanes(splats_in, range(0, 4 * LANES, 4)), rows)
     above = maximum(y, maximum(-floor(ry - my), 0)) - my
-    below = minimum(y + 3, minimum(floor(my + ry), as_float(height) - 1)) - my
+    below = minimum(y + 3, minimum(floor(my + ry), narrow(as_float(height), rows) - 1)) - my
     # Where the ellipse is widest between them, and how far it reaches there.
     end = minimum(maximum(right, above), below)
     begin = minimum(maximum(-right, above), below)
@@ -120,23 +118,26 @@ def _bands(splats_in, o, row, height, width):
     far = mx + slope * end + square_root(maximum(part * (reach - end * end * inverse_yy), 0))
     near = mx + slope * begin - square_root(maximum(part * (reach - begin * begin * inverse_yy), 0))
     first = maximum(-floor(-maximum(near, mx - rx)), 0)
-    last = minimum(floor(minimum(far, mx + rx)), as_float(width) - 1)
-    reached = where_greater(above, below, splat(mx, 0), where_greater(first, last, splat(mx, 0), 1))
-    return where_greater(reached, 0, floor(first * 0.25), 1e9), where_greater(
-        reached, 0, floor(last * 0.25), -1
-    )
+    last = minimum(floor(minimum(far, mx + rx)), narrow(as_float(width), rows) - 1)
+    none = splat(mx, 0, rows)
+    reached = where_greater(above, below, none, where_greater(first, last, none, 1))
+    first = where_greater(reached, 0, floor(first * 0.25), 1e9)
+    return first, where_greater(reached, 0, floor(last * 0.25), -1)
 
 
 @traced
 def _masks(first, last, column, memory):
-    """Of the four tiles in a column, the bits of the blocks that a Gaussian reaches, to memory[0, 4, 8,
+    """Of the tiles in a column, four or one, the bits of the blocks that a Gaussian reaches, to memory[0, 4, 8,
     12].
     """
-    c = as_float(column) * 4
-    bits = splat(first, 0)
+    rows = first.lanes
+    c = narrow(as_float(column) * 4, rows)
+    none = splat(first, 0, rows)
+    bits = none
     for k in range(4):
-        bits = bits + where_greater(first, c + k, splat(c, 0), where_greater(c + k, last, splat(c, 0), 2**k))
-    store(memory, 0, added_in_fours(bits * lanes(first, [16 ** (lane % 4) for lane in range(LANES)])))
+        bits = bits + where_greater(first, c + k, none, where_greater(c + k, last, none, 2**k))
+    places = narrow(lanes(first, [16 ** (lane % 4) for lane in range(LANES)]), rows)
+    store(memory, 0, added_in_fours(bits * places))
 
 
 @jit
@@ -172,13 +173,22 @@ def _find(
             r0 = int(top) // SIDE if top > _ZERO else 0
             r1 = int(bottom) // SIDE if bottom < height else (height - 1) // SIDE
             for r in range(r0, r1 + 1, 4):
-                first, last = _bands(splats_in, o, 4 * r, height, width)
-                begin = least(first)
-                end = largest(last)
+                small = r == r1  # as most are: one row of tiles
+                if small:
+                    first_one, last_one = _bands(splats_in, o, 4 * r, height, width, 4)
+                    begin = least(first_one)
+                    end = largest(last_one)
+                else:
+                    first, last = _bands(splats_in, o, 4 * r, height, width, LANES)
+                    begin = least(first)
+                    end = largest(last)
                 if begin > end:
                     continue
                 for c in range(int(begin) // 4, int(end) // 4 + 1):
-                    _masks(first, last, c, memory)
+                    if small:
+                        _masks(first_one, last_one, c, memory)
+                    else:
+                        _masks(first, last, c, memory)
                     for k in range(min(4, r1 + 1 - r)):
                         mask = int(memory[4 * k])
                         if mask != 0:

@@ -166,6 +166,7 @@ class TrainableGaussians:
         self._blocks, self._first, self._second = (aligned(self.rows * self._room) for _ in range(3))
         self._weight = aligned(self._room)
         self._splats = aligned(self._room * SLOTS)
+        self._sums = aligned(0)  # of a step, kept as fresh memory takes longer than a step's sums
         for part in (self._blocks, self._first, self._second, self._weight):
             part[:] = 0
 
@@ -273,7 +274,11 @@ class TrainableGaussians:
         # Pixels to sums for each entry (Gaussian in a tile), and these to parameters, which are moved at
         # once.
         colours = forward.Channels(3, self._splats, SLOTS, 6)
-        sums = backward.composite_back(tiles, colours, out, left, slope, np.zeros_like(left))
+        room = backward.sums_of(tiles)
+        if len(self._sums) < room:
+            self._sums = aligned(0)
+            self._sums = aligned(room + room // 4)
+        sums = backward.composite_back(tiles, colours, out, left, slope, np.zeros_like(left), self._sums)
         moments = self._first, self._second, self._weight
         of_camera = backward.adam(tiles, self._blocks, moments, self.bands, camera, sums, rates)
         if valid is None:
