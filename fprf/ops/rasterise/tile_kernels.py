@@ -64,7 +64,9 @@ _KEY_BITS = 22
 _DIGIT_BITS = 8
 """Bits that one pass of the sort looks at: a tile has some hundred entries."""
 _DIGITS = 1 << _DIGIT_BITS
+"""Values of a digit."""
 _PASSES = -(-_KEY_BITS // _DIGIT_BITS)
+"""Passes of the sort."""
 _RECORD = 4
 """Numbers of an entry before it is sorted: depth, Gaussian, slot, blocks."""
 
