@@ -109,6 +109,11 @@ BENCHMARKS = {
         "{folder}/town --views 2 --width 24 --height 18",
         "a folder to write into",
     ),
+    "record": Benchmark(
+        "measure a result again and write it with commit, command, date and sources",
+        "quick --folder {folder} --sources fprf/ops -- gaussians --count 500 --times 2",
+        "what the benchmark needs that made it",
+    ),
     "tables": Benchmark("tables of the documents, made from the results", "--check", "a clone"),
 }
 """`benchmarks/gpu.sh` measures a machine with a GPU."""

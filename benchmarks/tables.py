@@ -1,23 +1,27 @@
-"""Write the tables of the documents from the results, between `<!-- table: NAME -->` and `<!-- end -->`, and
-a drawing.
+"""Write what the documents take from the results: tables between `<!-- table: NAME -->` and `<!-- end -->`, links between
+`<!-- of: NAME -->` and `<!-- end -->`, and a drawing. Both say what a result is older than.
 
-    python -m benchmarks tables [--check]
+    python -m benchmarks tables [--check] [--before CHANGE]
 
-`--check` writes nothing, and ends with 1 where a page is not as the results are.
+`--check` writes nothing, and ends with 1 where a page is not as the results are. A result whose sources have changed is
+refused: measure it again (`python -m benchmarks record NAME`), or say by `--before` what has changed.
 """
 
 import argparse
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .curves import drawing
+from fprf.errors import UsageError
+from fprf.io.atomic import write_json
 
-RESULTS = Path(__file__).resolve().parent / "results"
-DOCS = RESULTS.parents[1] / "docs"
-CURVES = DOCS / "images" / "minutes.svg"
+from .curves import drawing
+from .evidence import OF, ROOT, document, link, pages, read_result, result_files, stale
+
+CURVES = ROOT / "docs" / "images" / "minutes.svg"
 PLACE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Rows = Iterable[Iterable[str]]
 
@@ -117,29 +121,55 @@ def markdown(rows: Rows) -> str:
     )
 
 
-def filled(page: str, results: Path = RESULTS) -> str:
-    """A page with its tables made anew."""
+def filled(path: Path, root: Path = ROOT) -> str:
+    """A page with its tables and links to results made anew."""
+    results = result_files(root)
 
     def table(place: re.Match[str]) -> str:
-        found = json.loads((results / f"{place[2]}.json").read_text("utf-8"))
-        return place[1] + markdown(TABLES[place[2]](found)) + place[3]
+        origin, found = read_result(results[place[2]])
+        below = f"\n*{origin.mark[:1].upper()}{origin.mark[1:]}.*\n\n" if origin.mark else ""
+        return place[1] + markdown(TABLES[place[2]](found)) + below + place[3]
 
-    return PLACE.sub(table, page)
+    def quoted(place: re.Match[str]) -> str:
+        return f"<!-- of: {place[1]} -->{link(place[1], path, root)}<!-- end -->"
+
+    return OF.sub(quoted, PLACE.sub(table, path.read_text("utf-8")))
 
 
-def drawn(results: Path = RESULTS) -> str:
+def drawn(root: Path = ROOT) -> str:
     """The drawing of `docs/images/minutes.svg`."""
-    return drawing(json.loads((results / "splat_training.json").read_text("utf-8")))
+    return drawing(read_result(result_files(root)["splat_training"])[1])
+
+
+def mark(change: str, root: Path = ROOT) -> list[str]:
+    """Say in every result whose sources have changed unsaid that it is of before a change; without one they are refused.
+    Returns their names.
+    """
+    old = [(name, path) for name, path in result_files(root).items() if stale(read_result(path)[0], root)]
+    if old and not change:
+        names = ", ".join(name for name, _ in old)
+        raise UsageError(
+            f"{names}: sources have changed since; measure again (python -m benchmarks record NAME), "
+            'or say what has changed (python -m benchmarks tables --before "CHANGE")'
+        )
+    for _, path in old:
+        origin, found = read_result(path)
+        write_json(path, document(replace(origin, before=change), found))
+    return [name for name, _ in old]
 
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks tables", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; end with 1 where a page differs")
+    parser.add_argument("--before", default="", metavar="CHANGE", help="what has changed since stale results were measured")
     asked = parser.parse_args(argv)
-    made = {path: filled(path.read_text("utf-8")) for path in sorted(DOCS.glob("*.md"))} | {CURVES: drawn()}
+    if not asked.check:
+        for name in mark(asked.before):
+            print(f"{name}: before {asked.before}")
+    made = {path: filled(path) for path in pages()} | {CURVES: drawn()}
     old = [path for path, text in made.items() if not path.is_file() or path.read_text("utf-8") != text]
     for path in old:
-        print(path.name)
+        print(path.relative_to(ROOT))
         if not asked.check:
             path.write_text(made[path], "utf-8")
     return int(asked.check and bool(old))

@@ -1,5 +1,4 @@
-"""What the documents name exists: files, modules, anchors and flags; tables are those of the results; the
-site builds.
+"""What the documents name exists: files, modules, anchors and flags; the site builds.
 """
 
 import importlib.util
@@ -14,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.tables import CURVES, DOCS, drawn, filled
 from fprf.cli import main as cli
 from fprf.cli.main import VERBS
 
-ROOT = DOCS.parent
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 LEGENDS = [ROOT / "fprf/interfaces.py", ROOT / "pyproject.toml"]
 """Files beside the documents that say where a newcomer adds what."""
@@ -96,15 +95,6 @@ def test_flags_exist(capsys: pytest.CaptureFixture[str]) -> None:
         if flag not in known and not ("." in flag and flag.rpartition(".")[2] in fields)
     ]
     assert not absent
-
-
-@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
-def test_tables_are_those_of_the_results(page: Path) -> None:
-    assert filled(page.read_text("utf-8")) == page.read_text("utf-8"), "python -m benchmarks tables"
-
-
-def test_the_drawing_is_that_of_the_results() -> None:
-    assert drawn() == CURVES.read_text("utf-8"), "python -m benchmarks tables"
 
 
 MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
