@@ -4,8 +4,9 @@ Each result, `benchmarks/results/NAME.json` or `docs/evidence/NAME.json`, has an
 command, the date, the sources (paths of the repository) that the figures depend on, and a hash of these sources. Once
 they have changed, the result is measured again, or `before` says what has changed; pages then repeat it.
 
-In a page a measured figure stands in a paragraph (item of a list, row of a table) with `<!-- of: NAME -->...<!-- end -->`, whose text `python -m benchmarks tables`
-writes, and has to be found in NAME.json; NAME/KEY/KEY looks in that part of it alone. Paragraphs whose numbers are no
+In a page a measured figure stands in a paragraph (or item of a list) with `<!-- of: NAME -->...<!-- end -->`, whose text `python -m benchmarks tables`
+writes, and has to be found in NAME.json; NAME/KEY/KEY looks in that part of it alone. A table belongs to the
+paragraph above it. Paragraphs whose numbers are no
 measurements of ours say so: `<!-- unmeasured: WHY -->`.
 """
 
@@ -26,6 +27,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = (Path("benchmarks/results"), Path("docs/evidence"))
 ORIGIN = "origin"
 """Key of a result that holds where it comes from."""
+DERIVED = "derived"
+"""Key of a result that holds differences and ratios of its figures which pages quote, by what they are: `A - B`, `A : B`."""
 HASH_DIGITS = 16
 
 
@@ -128,7 +131,7 @@ def _code(node: Any) -> Iterator[str]:
 
 
 OF = re.compile(r"<!-- of: (\S+) -->(.*?)<!-- end -->", re.DOTALL)
-TABLE = re.compile(r"<!-- table: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
+TABLE = re.compile(r"<!-- table: [\w ]+ -->\n.*?<!-- end -->", re.DOTALL)
 UNMEASURED = re.compile(r"<!-- unmeasured: [^>]+ -->")
 _CODE_BLOCK = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 _CODE = re.compile(r"`[^`\n]*`")
@@ -141,6 +144,7 @@ _FIGURE = re.compile(
     rf"|(?<![\w.,/:=])(?P<bare>\d+\.\d\d+)(?![\w.%])"
 )
 _SCALES = {
+    "s": (1.0, 1e-3),
     "ms": (1.0, 1e3),
     "min": (1.0, 1 / 60),
     "h": (1.0, 1 / 3600),
@@ -207,28 +211,53 @@ def values(found: Any) -> Iterator[float]:
 
 
 def quoted(name: str, root: Path = ROOT) -> list[float]:
-    """Numbers that a paragraph with `<!-- of: NAME/KEY/... -->` may quote. Raises DataError for what is not there."""
+    """Numbers that a paragraph with `<!-- of: NAME/KEY/... -->` may quote: those of that part, and without a key also what
+    `derived` computes and the numbers of the command. Raises DataError for what is not there.
+    """
     stem, *keys = name.split("/")
     path = result_files(root).get(stem)
     if path is None:
         raise DataError(f"{name}: no such result in {' or '.join(map(str, FOLDERS))}")
     origin, found = read_result(path)
-    part: Any = found
+    if keys:
+        return list(values(part(found, keys, path)))
+    computed = [derived(text, found, path) for text in found.pop(DERIVED, {}).values()]
+    return [*values(found), *values(origin.command), *computed]
+
+
+def part(found: Any, keys: list[str], path: Path) -> Any:
+    """What stands in a result under one key after the other; in a list the key is a position. `_` also finds a blank."""
     for key in keys:
         try:
-            part = part[int(key) if isinstance(part, list) else key.replace("_", " ") if key not in part else key]
+            if isinstance(found, list):
+                found = found[int(key)]
+            else:
+                found = found[key if key in found else key.replace("_", " ")]
         except (KeyError, IndexError, ValueError, TypeError):
-            raise DataError(f"{name}: {path.name} has no {key}") from None
-    return [*values(part), *(values(origin.command) if not keys else ())]
+            raise DataError(f"{path.name}: no {key} in {'/'.join(keys)}") from None
+    return found
+
+
+def derived(text: str, found: Any, path: Path) -> float:
+    """A difference or ratio of two numbers of a result, `KEY/KEY - KEY/KEY` or `KEY/KEY : KEY/KEY`."""
+    first, sign, second = re.split(r" ([-:]) ", text)
+    left = float(part(found, first.split("/"), path))
+    right = float(part(found, second.split("/"), path))
+    return left - right if sign == "-" else left / right
 
 
 def unfounded(page: str, root: Path = ROOT) -> list[str]:
     """A line for each figure of a page that stands in no result that its paragraph names."""
     wrong = []
+    above: list[str] = []
     for block in blocks(page):
+        names = [place[1] for place in OF.finditer(block)]
+        if block.lstrip().startswith("|"):
+            names += above
+        else:
+            above = names
         if UNMEASURED.search(block):
             continue
-        names = [place[1] for place in OF.finditer(block)]
         known = [value for name in names for value in quoted(name, root)]
         for figure in figures(block):
             if not any(map(figure.equals, known)):
@@ -257,4 +286,4 @@ def uncited(root: Path = ROOT) -> list[str]:
     known = result_files(root)
     texts = [path.read_text("utf-8") for path in (*pages(root), *sorted((root / "fprf").rglob("*.py")))]
     everything = "\n".join(texts)
-    return [name for name in known if not re.search(rf"(table: {name} |of: {name}[/ ]|\b{re.escape(name)}\.(json|md)\b)", everything)]
+    return [name for name in known if not re.search(rf"(table: {name} |of:? {name}[/ ]|\b{re.escape(name)}\.(json|md)\b)", everything)]

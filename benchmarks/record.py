@@ -21,7 +21,7 @@ from typing import Any
 from fprf.errors import DataError, UsageError
 from fprf.io.atomic import write_json
 
-from .evidence import FOLDERS, ORIGIN, ROOT, Origin, document, read_result, result_files, sources_hash
+from .evidence import DERIVED, FOLDERS, ORIGIN, ROOT, Origin, document, read_result, result_files, sources_hash
 from .report import commit
 
 RUN = ("python", "-m", "benchmarks")
@@ -52,6 +52,9 @@ def main(argv: list[str]) -> int:
         words = argv[cut + 1 :] or _words(asked.name, known)
         command = shlex.join([*RUN, *words])
         figures = _measured(words)
+        kept = _figures(path).get(DERIVED) if path.is_file() else None
+        if kept:
+            figures = {**figures, DERIVED: kept}
     made = Origin(
         commit=commit(ROOT) or "no checkout",
         command=command,

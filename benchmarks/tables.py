@@ -22,7 +22,8 @@ from .curves import drawing
 from .evidence import OF, ROOT, document, link, pages, read_result, result_files, stale
 
 CURVES = ROOT / "docs" / "images" / "minutes.svg"
-PLACE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+PLACE = re.compile(r"(<!-- table: (\w+)(?: of (\w+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+"""`NAME`, or `NAME of RESULT` where they differ."""
 Rows = Iterable[Iterable[str]]
 
 
@@ -104,10 +105,84 @@ def splat_restyle(found: Any) -> Rows:
         yield row["capture"], str(row["gaussians"]), *seconds, f"{row['peak_mib']:.0f} MiB"
 
 
+def palettes(found: Any) -> Rows:
+    """The restyled town light by light, one reference; the best of each row is bold."""
+    ways = ["no change", "reinhard", "histogram", "adain", "local-adain", "region-ot", "region-tone"]
+    yield "", *ways
+    for palette, ran in found["palettes"].items():
+        rows = [ran["one"]["rows"][way] for way in ways]
+        highest = max(row["psnr"] for row in rows)
+        nearest = min(row["lpips"] for row in rows)
+        cells = []
+        for row in rows:
+            psnr = "**" if row["psnr"] == highest else ""
+            lpips = "**" if row["lpips"] == nearest else ""
+            cells.append(f"{psnr}{row['psnr']:.2f}{psnr}, {lpips}{row['lpips']:.3f}{lpips}")
+        yield palette, *cells
+
+
+def cells(found: Any) -> Rows:
+    """Gaussians in one piece and in cells, and blocks of fields."""
+    yield "capture", "one piece", "cells", "blocks of `fprf-lite`", "error at cell borders over that elsewhere"
+    for scene, row in found.items():
+        ways = [row[way]["psnr"] for way in ("one_piece", "in_cells", "fprf_lite_blocks")]
+        ratio = row["in_cells"]["border_error_over_inside"]
+        yield scene, *(f"**{psnr:.2f} dB**" if psnr == max(ways) else f"{psnr:.2f} dB" for psnr in ways), f"{ratio:.2f}"
+
+
+ENCODERS = {"bundled-semantic": "`bundled-semantic`", "concat": "`bundled-semantic` and `dinov2`: the default", "vgg19": "`vgg19`"}
+"""Rows of the table of encoders: how each begins in the result, and what it is called in the page."""
+
+
+def semantic_matching(found: Any) -> Rows:
+    """Encoders that fprf ships."""
+    yield "encoder", "triplets", "town"
+    for row in found["rows"]:
+        told = ENCODERS.get(row["encoder"].partition(":")[0])
+        if told:
+            yield told, f"{row['triplets']['matching']:.3f}", f"{row['town']['match']:.3f}"
+
+
+def gpu(found: Any) -> Rows:
+    """What a minute of a GPU gives, beside the goal."""
+    yield "method", "PSNR", "goal", "SSIM", "LPIPS"
+    goals = {row["name"]: row.get("goal") for row in found["rows"]}
+    for method, name in (("fprf-splats", "held-out PSNR of 3D Gaussians"), ("fprf", "held-out PSNR")):
+        row = found["metrics"][method]
+        goal = "" if goals[name] is None else f"{goals[name]:.0f} dB"
+        if goals[name] is not None and row["psnr"] < goals[name]:
+            goal += ": missed"
+        yield f"`{method}`", f"{row['psnr']:.1f} dB", goal, f"{row['ssim']:.3f}", f"{row['lpips']:.3f}"
+
+
+FASTER = {
+    "train": "training with all features",
+    "render": "rendering",
+    "stylised, region-tone": "restyled rendering, `region-tone`",
+    "stylised, local-adain": "restyled rendering, `local-adain`",
+    "cached view restyled, region-tone": "a cached view in another style",
+}
+"""Rows of the table of speed: names in the result, and in the page."""
+
+
+def speed_fox(found: Any) -> Rows:
+    """Fields against plain torch without skipping, in one run."""
+    yield "fox at half its size", "fprf", "plain torch", "ratio", "largest error, or of the gradient"
+    for row in found["rows"]:
+        if row["name"] in FASTER:
+            ours, plain = (f"{row[key]:.3g} ms" if row["unit"] == "ms" else f"{row[key]:.0f} {row['unit']}" for key in ("figure", "peer"))
+            yield FASTER[row["name"]], ours, plain, f"{row['ratio']:.1f}", f"{row['error']:.2g}"
+
+
 TABLES: Mapping[str, Callable[[Any], Rows]] = {
+    "cells": cells,
+    "gpu": gpu,
+    "semantic_matching": semantic_matching,
+    "speed_fox": speed_fox,
     "splat_training": splat_training,
     "training_steps": training_steps,
     "methods": methods,
+    "palettes": palettes,
     "restyle_town_gaussians": restyle_town_gaussians,
     "splat_restyle": splat_restyle,
 }
@@ -126,9 +201,9 @@ def filled(path: Path, root: Path = ROOT) -> str:
     results = result_files(root)
 
     def table(place: re.Match[str]) -> str:
-        origin, found = read_result(results[place[2]])
+        origin, found = read_result(results[place[3] or place[2]])
         below = f"\n*{origin.mark[:1].upper()}{origin.mark[1:]}.*\n\n" if origin.mark else ""
-        return place[1] + markdown(TABLES[place[2]](found)) + below + place[3]
+        return place[1] + markdown(TABLES[place[2]](found)) + below + place[4]
 
     def quoted(place: re.Match[str]) -> str:
         return f"<!-- of: {place[1]} -->{link(place[1], path, root)}<!-- end -->"
