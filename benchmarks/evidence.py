@@ -4,10 +4,10 @@ Each result, `benchmarks/results/NAME.json` or `docs/evidence/NAME.json`, has an
 command, the date, the sources (paths of the repository) that the figures depend on, and a hash of these sources. Once
 they have changed, the result is measured again, or `before` says what has changed; pages then repeat it.
 
-In a page a measured figure stands in a paragraph (or item of a list) with `<!-- of: NAME -->...<!-- end -->`, whose text `python -m benchmarks tables`
-writes, and has to be found in NAME.json; NAME/KEY/KEY looks in that part of it alone. A table belongs to the
-paragraph above it. Paragraphs whose numbers are no
-measurements of ours say so: `<!-- unmeasured: WHY -->`.
+In a page a measured figure stands in a paragraph (or item of a list) with `<!-- of: NAME -->...<!-- end -->`, whose text
+`python -m benchmarks tables` writes, and has to be found in NAME.json; NAME/KEY/KEY looks in that part of it alone. A
+table belongs to the paragraph above it. Paragraphs whose numbers are no measurements of ours say so:
+`<!-- unmeasured: WHY -->`.
 """
 
 import ast
@@ -120,7 +120,11 @@ def _code(node: Any) -> Iterator[str]:
     if not isinstance(node, ast.AST):
         yield repr(node)
         return
-    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+    if (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    ):
         return
     yield f"{type(node).__name__}("
     for name, value in ast.iter_fields(node):
@@ -173,7 +177,8 @@ class Figure:
         if " " in self.text:
             last = 10.0 ** (len(digits) - len(digits.rstrip("0")))
         return any(
-            abs(abs(value) * scale - float(digits)) <= _ROUNDING * last for scale in _SCALES.get(self.unit, (1.0,))
+            abs(abs(value) * scale - float(digits)) <= _ROUNDING * last
+            for scale in _SCALES.get(self.unit, (1.0,))
         )
 
 
@@ -191,7 +196,11 @@ def figures(block: str) -> Iterator[Figure]:
         if found["bare"]:
             yield Figure(found["bare"], "")
             continue
-        unit = re.sub(r"(second|minute|hour)s?", lambda word: word[1][0] if word[1] != "minute" else "min", found["unit"])
+        unit = re.sub(
+            r"(second|minute|hour)s?",
+            lambda word: word[1][0] if word[1] != "minute" else "min",
+            found["unit"],
+        )
         for number in re.findall(_NUMBER, found["list"]):
             yield Figure(number, unit)
 
@@ -262,7 +271,9 @@ def unfounded(page: str, root: Path = ROOT) -> list[str]:
         for figure in figures(block):
             if not any(map(figure.equals, known)):
                 where = f"not in {', '.join(names)}" if names else "its paragraph names no result"
-                wrong.append(f"{figure.text} {figure.unit}".strip() + f": {where}: {' '.join(block.split())[:90]}")
+                wrong.append(
+                    f"{figure.text} {figure.unit}".strip() + f": {where}: {' '.join(block.split())[:90]}"
+                )
     return wrong
 
 
@@ -286,4 +297,8 @@ def uncited(root: Path = ROOT) -> list[str]:
     known = result_files(root)
     texts = [path.read_text("utf-8") for path in (*pages(root), *sorted((root / "fprf").rglob("*.py")))]
     everything = "\n".join(texts)
-    return [name for name in known if not re.search(rf"(table: {name} |of:? {name}[/ ]|\b{re.escape(name)}\.(json|md)\b)", everything)]
+    return [
+        name
+        for name in known
+        if not re.search(rf"(table: {name} |of:? {name}[/ ]|\b{re.escape(name)}\.(json|md)\b)", everything)
+    ]

@@ -1,9 +1,11 @@
 """Measure a result again, or for the first time, and write it with commit, command, date and sources.
 
-    python -m benchmarks record NAME                                   the command and the sources that NAME.json names
-    python -m benchmarks record NAME --sources PATH ... -- BENCHMARK FLAGS   a new result, or another command
-    python -m benchmarks record NAME --command "by hand: ..."          the figures in NAME.json, put there by hand, are of this tree
+    python -m benchmarks record NAME
+    python -m benchmarks record NAME --sources PATH ... -- BENCHMARK FLAGS
+    python -m benchmarks record NAME --command "by hand: ..."
 
+The first runs the command that NAME.json names, with its sources. The second makes a new result, or takes another command.
+The third runs nothing: the figures that were put into NAME.json by hand are of this tree.
 NAME.json lies in benchmarks/results (or docs/evidence, where it is there already). `--output` is added to the command.
 Then `python -m benchmarks tables` writes tables and marks of the documents.
 """
@@ -21,7 +23,17 @@ from typing import Any
 from fprf.errors import DataError, UsageError
 from fprf.io.atomic import write_json
 
-from .evidence import DERIVED, FOLDERS, ORIGIN, ROOT, Origin, document, read_result, result_files, sources_hash
+from .evidence import (
+    DERIVED,
+    FOLDERS,
+    ORIGIN,
+    ROOT,
+    Origin,
+    document,
+    read_result,
+    result_files,
+    sources_hash,
+)
 from .report import commit
 
 RUN = ("python", "-m", "benchmarks")
@@ -29,12 +41,18 @@ RUN = ("python", "-m", "benchmarks")
 
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks record", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m benchmarks record",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("name", help="result, without .json")
-    parser.add_argument("--sources", nargs="+", metavar="PATH", help="files and folders that the figures depend on")
+    parser.add_argument(
+        "--sources", nargs="+", metavar="PATH", help="files and folders that the figures depend on"
+    )
     parser.add_argument("--folder", type=Path, default=ROOT / FOLDERS[0], help="of a new result")
-    parser.add_argument("--command", help="run nothing: this has made the figures that NAME.json holds, on this tree")
+    parser.add_argument(
+        "--command", help="run nothing: this has made the figures that NAME.json holds, on this tree"
+    )
     cut = argv.index("--") if "--" in argv else len(argv)
     asked = parser.parse_args(argv[:cut])
     path = result_files().get(asked.name, asked.folder / f"{asked.name}.json")
@@ -100,7 +118,11 @@ def _measured(words: list[str]) -> dict[str, Any]:
         words = words[:at] + words[at + 2 :]
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "result.json"
-        process = subprocess.run([sys.executable, "-m", "benchmarks", *words, "--output", str(output)], cwd=ROOT)
+        process = subprocess.run(
+            [sys.executable, "-m", "benchmarks", *words, "--output", str(output)], cwd=ROOT
+        )
         if process.returncode or not output.is_file():
-            raise UsageError(f"{shlex.join([*RUN, *words])}: exit code {process.returncode}, no result written")
+            raise UsageError(
+                f"{shlex.join([*RUN, *words])}: exit code {process.returncode}, no result written"
+            )
         return _figures(output)

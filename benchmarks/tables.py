@@ -8,7 +8,6 @@ refused: measure it again (`python -m benchmarks record NAME`), or say by `--bef
 """
 
 import argparse
-import json
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -19,7 +18,7 @@ from fprf.errors import UsageError
 from fprf.io.atomic import write_json
 
 from .curves import drawing
-from .evidence import OF, ROOT, document, link, pages, read_result, result_files, stale
+from .evidence import DERIVED, OF, ROOT, document, link, pages, read_result, result_files, stale
 
 CURVES = ROOT / "docs" / "images" / "minutes.svg"
 PLACE = re.compile(r"(<!-- table: (\w+)(?: of (\w+))? -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -123,14 +122,28 @@ def palettes(found: Any) -> Rows:
 
 def cells(found: Any) -> Rows:
     """Gaussians in one piece and in cells, and blocks of fields."""
-    yield "capture", "one piece", "cells", "blocks of `fprf-lite`", "error at cell borders over that elsewhere"
+    yield (
+        "capture",
+        "one piece",
+        "cells",
+        "blocks of `fprf-lite`",
+        "error at cell borders over that elsewhere",
+    )
     for scene, row in found.items():
         ways = [row[way]["psnr"] for way in ("one_piece", "in_cells", "fprf_lite_blocks")]
         ratio = row["in_cells"]["border_error_over_inside"]
-        yield scene, *(f"**{psnr:.2f} dB**" if psnr == max(ways) else f"{psnr:.2f} dB" for psnr in ways), f"{ratio:.2f}"
+        yield (
+            scene,
+            *(f"**{psnr:.2f} dB**" if psnr == max(ways) else f"{psnr:.2f} dB" for psnr in ways),
+            f"{ratio:.2f}",
+        )
 
 
-ENCODERS = {"bundled-semantic": "`bundled-semantic`", "concat": "`bundled-semantic` and `dinov2`: the default", "vgg19": "`vgg19`"}
+ENCODERS = {
+    "bundled-semantic": "`bundled-semantic`",
+    "concat": "`bundled-semantic` and `dinov2`: the default",
+    "vgg19": "`vgg19`",
+}
 """Rows of the table of encoders: how each begins in the result, and what it is called in the page."""
 
 
@@ -170,7 +183,10 @@ def speed_fox(found: Any) -> Rows:
     yield "fox at half its size", "fprf", "plain torch", "ratio", "largest error, or of the gradient"
     for row in found["rows"]:
         if row["name"] in FASTER:
-            ours, plain = (f"{row[key]:.3g} ms" if row["unit"] == "ms" else f"{row[key]:.0f} {row['unit']}" for key in ("figure", "peer"))
+            ours, plain = (
+                f"{row[key]:.3g} ms" if row["unit"] == "ms" else f"{row[key]:.0f} {row['unit']}"
+                for key in ("figure", "peer")
+            )
             yield FASTER[row["name"]], ours, plain, f"{row['ratio']:.1f}", f"{row['error']:.2g}"
 
 
@@ -202,6 +218,7 @@ def filled(path: Path, root: Path = ROOT) -> str:
 
     def table(place: re.Match[str]) -> str:
         origin, found = read_result(results[place[3] or place[2]])
+        found.pop(DERIVED, None)
         below = f"\n*{origin.mark[:1].upper()}{origin.mark[1:]}.*\n\n" if origin.mark else ""
         return place[1] + markdown(TABLES[place[2]](found)) + below + place[4]
 
@@ -213,7 +230,9 @@ def filled(path: Path, root: Path = ROOT) -> str:
 
 def drawn(root: Path = ROOT) -> str:
     """The drawing of `docs/images/minutes.svg`."""
-    return drawing(read_result(result_files(root)["splat_training"])[1])
+    _, found = read_result(result_files(root)["splat_training"])
+    found.pop(DERIVED, None)
+    return drawing(found)
 
 
 def mark(change: str, root: Path = ROOT) -> list[str]:
@@ -236,7 +255,9 @@ def mark(change: str, root: Path = ROOT) -> list[str]:
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks tables", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; end with 1 where a page differs")
-    parser.add_argument("--before", default="", metavar="CHANGE", help="what has changed since stale results were measured")
+    parser.add_argument(
+        "--before", default="", metavar="CHANGE", help="what has changed since stale results were measured"
+    )
     asked = parser.parse_args(argv)
     if not asked.check:
         for name in mark(asked.before):

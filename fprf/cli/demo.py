@@ -16,16 +16,16 @@ from .parsing import parse
 
 TITLE = "One garden, photographed once"
 LEAD = (
-    "Trained on a CPU from 25 photographs. Each look is then taken from one picture, without training, and is the same "
+    "Trained on a CPU from 25 photographs. Each look is then taken from one photograph, without training, and is the same "
     "from every viewpoint."
 )
-LOOKS = ("winter", "night", "sunset", "autumn")
+LOOKS = ("sunrise", "morning", "sunset", "night")
 """References, in the order in which they are shown."""
 ALL_TOGETHER = "all together"
 """Name of the style of all references."""
 CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
-    "Autumn and sunset: Aitzol Berasategi, CC BY 4.0; reduced. Winter and night: pictures of fprf's own towns.",
+    "Sunrise, morning, sunset and night: crops of panoramas by Greg Zaal (HDRI Haven, now Poly Haven), CC0.",
 )
 
 

@@ -13,6 +13,12 @@
 """
 
 from importlib.resources import files
+from pathlib import Path
+
+GARDEN = Path(str(files("fprf") / "garden"))
+"""Photographs of a place that ship with fprf."""
+EXAMPLES = {path.name: path for path in sorted((GARDEN / "references").glob("*.jpg"))}
+"""Photographs to restyle a scene with that ship with fprf, by name."""
 
 
 def read_asset(name: str) -> str:

@@ -34,7 +34,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
-from . import read_asset, script
+from . import EXAMPLES, read_asset, script
 from .messages import StartRequest, read_message
 from .start import Start
 
@@ -408,10 +408,10 @@ class ViewerServer:
 
     def _routes(self) -> list[BaseRoute]:
         # The stage of any page, with the panel of the served one.
-        stage = Template(read_asset("stage.html")).substitute(
-            still="hidden", ratio="", facts=read_asset("panel.html")
-        )
-        page = Template(read_asset("live.html")).substitute(stage=stage)
+        examples = "\n".join(_example(name) for name in EXAMPLES)
+        panel = Template(read_asset("panel.html")).substitute(examples=examples)
+        stage = Template(read_asset("stage.html")).substitute(still="hidden", ratio="", facts=panel)
+        page = Template(read_asset("live.html")).substitute(stage=stage, examples=examples)
         return [
             Route("/", _asset("text/html", lambda: page)),
             Route("/app.js", _asset("text/javascript", lambda: script(*_LIVE_SCRIPTS) + "\nlive();\n")),
@@ -420,6 +420,7 @@ class ViewerServer:
             Route("/scene", self._scene),
             Route("/colours", self._colours),
             Route("/card", self._card),
+            Route("/examples/{name}", self._example),
             Route("/gaussians", self._gaussians),
             Route("/film", self._film),
             Route("/photograph", self._photograph, methods=["POST"]),
@@ -487,6 +488,12 @@ class ViewerServer:
 
         photograph = self.session.state.photograph(_integer(request, "card"))
         return Response(encode(photograph.thumbnail, "webp"), media_type="image/webp")
+
+    async def _example(self, request: Request) -> Response:
+        path = EXAMPLES.get(request.path_params["name"])
+        if path is None:
+            raise HTTPException(404, "no such photograph")
+        return FileResponse(path)
 
     async def _gaussians(self, request: Request) -> Response:
         return self._download(await asyncio.to_thread(self.session.gaussians), "restyled.ply")
@@ -564,6 +571,13 @@ def _integer(request: Request, name: str) -> int:
     if not (text.isdigit() and text.isascii() and len(text) <= 12):
         raise UsageError(f"{name}: {text[:20]!r} is no number from 0")
     return int(text)
+
+
+def _example(name: str) -> str:
+    """A photograph that ships with fprf, as a link that saves it where no script takes it."""
+    link = f'class="example" data-example="{name}" href="/examples/{name}" download title="by Greg Zaal, CC0"'
+    word = name.partition(".")[0]
+    return f'<a {link}><img src="/examples/{name}" alt="{word}">{word}</a>'
 
 
 def _asset(kind: str, text: Callable[[], str]) -> Callable[[Request], Response]:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..errors import DataError, FprfError, UsageError
+from . import GARDEN
 from .messages import Leave, Make, New, Open, StartRequest, Stop
 from .uploads import SceneFiles, Source, find_source, is_capture, newest_step, training_progress
 
@@ -92,7 +93,13 @@ class Start:
         """How far it is, as the page reads it; idle, what can be opened."""
         progress = self._progress
         recent = self._recent() if progress.stage == "idle" else []
-        return {"type": "start", **asdict(progress), "output": str(self._output), "recent": recent}
+        return {
+            "type": "start",
+            **asdict(progress),
+            "output": str(self._output),
+            "recent": recent,
+            "garden": str(GARDEN),
+        }
 
     def handle(self, asked: StartRequest) -> dict[str, str]:
         """Do what the page asks for. Raises UsageError or DataError where no scene can be made of what is

@@ -8,7 +8,17 @@ from pathlib import Path
 import pytest
 
 from benchmarks import evidence, record
-from benchmarks.evidence import ROOT, Figure, Origin, read_result, result_files, sources_hash, stale, uncited, unfounded
+from benchmarks.evidence import (
+    ROOT,
+    Figure,
+    Origin,
+    read_result,
+    result_files,
+    sources_hash,
+    stale,
+    uncited,
+    unfounded,
+)
 from benchmarks.tables import CURVES, drawn, filled, mark
 from fprf.errors import DataError, UsageError
 

@@ -1,5 +1,4 @@
-"""What the documents name exists: files, modules, anchors and flags; the site builds.
-"""
+"""What the documents name exists: files, modules, anchors and flags; the site builds."""
 
 import importlib.util
 import os

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
-from fprf.page import server
+from fprf.page import EXAMPLES, server
 from fprf.page.server import Access, Client, ViewerServer, cookie_name, make_access
 
 HERE = Access("127.0.0.1", None)
@@ -131,6 +131,14 @@ def test_a_page_comes_with_headers_that_keep_it_to_itself(http: ViewerServer) ->
     assert answer.startswith(b"HTTP/1.1 200 ") and answer.endswith(b"</html>\n")
     for header in (b"x-frame-options: DENY", b"x-content-type-options: nosniff", b"connection: close"):
         assert header in answer
+
+
+def test_photographs_that_ship_are_offered_and_no_other_file(http: ViewerServer) -> None:
+    page = request(http, "GET /").decode()
+    for name, path in EXAMPLES.items():
+        assert f'data-example="{name}"' in page
+        assert request(http, f"GET /examples/{name}").endswith(path.read_bytes())
+    assert len(EXAMPLES) >= 4 and status(http, "GET /examples/..%2ftransforms.json") == 404
 
 
 def test_bodies_and_queries_arrive(http: ViewerServer) -> None:

@@ -68,6 +68,7 @@ class Panel {
 
   /** @param {ShelfRow[]} shelf */
   fillShelf(shelf) {
+    at("examples").hidden = shelf.length > 0;
     const now = new Set(shelf.map((row) => row.card));
     for (const [card, node] of this.cards) {
       if (now.has(card)) continue;

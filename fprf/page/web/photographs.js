@@ -20,6 +20,13 @@ class Photographs {
       const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
       if (live.scene && files.length) this.send(files);
     });
+    for (const link of document.querySelectorAll("[data-example]")) {
+      link.onclick = (event) => {
+        if (!live.scene) return; // before there is a scene it is saved as a file
+        event.preventDefault();
+        this.example(link.dataset.example);
+      };
+    }
     at("add-photograph").onclick = () => at("photographs").click();
     at("photographs").onchange = async () => {
       await this.send(at("photographs").files);
@@ -39,6 +46,16 @@ class Photographs {
     at("veil").hidden = !(on && this.live.scene);
     at("drop").classList.toggle("over", on);
     return true;
+  }
+
+  /**
+   * Send one of the photographs that ship with fprf.
+   * @param {string} name
+   */
+  async example(name) {
+    const answer = await fetch(`/examples/${name}`);
+    if (answer.ok) await this.send([new File([await answer.blob()], name)]);
+    else say(`${name}: ${answer.statusText}`, true);
   }
 
   /**

@@ -26,7 +26,7 @@ const tidy = (rows) => {
 
 class Start {
   constructor() {
-    Object.assign(this, { sending: null });
+    Object.assign(this, { sending: null, garden: "" });
     at("pick-files").onclick = () => at("files").click();
     at("pick-folder").onclick = () => at("folder").click();
     for (const id of ["files", "folder"]) {
@@ -36,6 +36,7 @@ class Start {
       };
     }
     at("path").onsubmit = (event) => { event.preventDefault(); this.open(at("path-of").value); };
+    at("open-garden").onclick = () => this.open(this.garden);
     at("stop").onclick = () => this.stop();
   }
 
@@ -96,6 +97,7 @@ class Start {
     at("choose").hidden = !idle;
     at("making").hidden = idle;
     if (idle) {
+      if (state.garden) this.garden = state.garden;
       at("strip").replaceChildren();
       at("recent").hidden = !state.recent.length;
       at("recent").querySelector("ul").replaceChildren(...state.recent.map((row) => make("li", {}, make("button", { type: "button", title: row.path, onclick: () => this.open(row.path) },
