@@ -304,4 +304,4 @@ def test_every_cell_runs_in_order_on_the_garden(
     assert "25 captured views" in told and "film.mp4:" in told and "'night.jpg'" in told
     assert len(read_capture(Path("night.ply")).gaussians) > 500
     made = {path.name for path in tmp_path.iterdir()}
-    assert {"plain.png", "wide.png", "autumn.png", "mine.json", "film.mp4"} <= made
+    assert {"plain.png", "wide.png", "sunrise.png", "mine.json", "film.mp4"} <= made
