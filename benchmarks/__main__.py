@@ -51,6 +51,11 @@ BENCHMARKS = {
     "kills": Benchmark(
         "training that is killed a hundred times", "--kills 3 --steps 25", "ten minutes; Linux"
     ),
+    "light": Benchmark(
+        "every method by the true answer: fixed cameras, the left half of another light is the reference",
+        "--folder {town}/images --lights 1 --seeds 0 --width 64",
+        "folders of pictures of fixed cameras; without them it is skipped",
+    ),
     "mutants": Benchmark(
         "how many small mistakes in the mathematics the tests notice",
         "--only fprf/rendering/splines.py --sample 2",
@@ -115,6 +120,11 @@ BENCHMARKS = {
         "what the benchmark needs that made it",
     ),
     "tables": Benchmark("tables of the documents, made from the results", "--check", "a clone"),
+    "wild": Benchmark(
+        "every method by the true answer: half of a photograph in the wild restyles the scene at its pose",
+        "--runs {run} --split test --longest 64 --seeds 0 --device cpu",
+        "runs of captures in several lights; without them it is skipped",
+    ),
 }
 """`benchmarks/gpu.sh` measures a machine with a GPU."""
 

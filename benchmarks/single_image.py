@@ -81,7 +81,11 @@ class _Colours(Decoder):
 
 
 def flat_look(
-    flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder | None
+    flat: Flat,
+    dictionary: StyleDictionary,
+    config: StylizerConfig,
+    decoder: Decoder | None,
+    bold: float = StyleConfig.bold,
 ) -> Restyle:
     """Restyle the photograph as `fprf stylize` would. Without a decoder its content is its colours, as in
     `splats.restyle`.
@@ -91,7 +95,7 @@ def flat_look(
     light = None
     if config.light:
         own = decoded_colours(stylizer, flat.style, decoder, features=0.0)
-        light = light_of(flat.style, dictionary, config, own, bold=StyleConfig.bold)
+        light = light_of(flat.style, dictionary, config, own, bold=bold)
         light = None if light is None else light.to(device)
     if decoder is None:
         maps = region_maps(
