@@ -259,10 +259,10 @@ def test_the_demo_from_nothing_to_a_page(
     out = tmp_path / "out"
     args = ["demo", "--output", str(out), "--minutes", "5", "--downscale", "8"]
     assert cli.main(args) == 0
-    styles = ["all-together.ply", "autumn.ply", "night.ply", "sunset.ply", "winter.ply"]
+    styles = ["all-together.ply", "morning.ply", "night.ply", "sunrise.ply", "sunset.ply"]
     assert {p.name for p in out.iterdir()} >= {"run", "metrics.json", "garden.html", *styles}
     plain, *others = [
-        read_capture(out / name).gaussians for name in ("night.ply", "autumn.ply", "winter.ply")
+        read_capture(out / name).gaussians for name in ("night.ply", "sunrise.ply", "sunset.ply")
     ]
     assert all(
         torch.equal(plain.means, each.means) and not torch.equal(plain.harmonics, each.harmonics)
@@ -277,7 +277,7 @@ def test_the_demo_from_nothing_to_a_page(
     )
     assert metrics["total_seconds"] > metrics["new_style_seconds"] > 0
     page = (out / "garden.html").read_text()
-    assert "CC BY 4.0" in page and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page), (
+    assert "CC0" in page and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page), (
         "it loads nothing"
     )
     assert f"open {out / 'garden.html'}" in capsys.readouterr().out
