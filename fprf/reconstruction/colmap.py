@@ -35,19 +35,22 @@ from .lenses import (
 )
 from .motion import still_share
 from .pairs import (
-    VISUAL_WORDS,
+    LARGEST_FEATURES,
     Descriptors,
-    build_vocabulary,
-    descriptors,
+    Pair,
+    largest_features,
     sequential_pairs,
+    shared_features,
     similar_pairs,
-    vlad_vectors,
 )
-from .scene_folder import MatchTables, Progress, SceneFolder, State, count_rows, step_key
+from .scene_folder import MatchTables, Progress, SceneFolder, State, count_rows, step_key, tried_pairs
 from .worker import NO_MODEL, NO_PYCOLMAP
 
-_MAX_EXHAUSTIVE_IMAGES = 120
-"""Images up to which `auto` matches all with all: 7000 pairs, minutes on a few cores."""
+_MAX_EXHAUSTIVE_IMAGES = 30
+"""Images up to which `auto` matches all with all: 435 pairs, a quarter of a minute on two cores."""
+_MAX_LOST_PAIRS = 7140
+"""Pairs by which `auto` looks for partners of images without a pose, at most: all of 120 images, minutes on two
+cores."""
 _ORDER_NEIGHBOURS = 2
 """Neighbours by name that photographs are matched with beside those that look alike: where things look alike
 everywhere they help."""
@@ -65,6 +68,10 @@ _TITLES = {
     "lenses": "comparing lenses",
 }
 _COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
+
+
+class _NothingFitsError(DataError):
+    """No two images fit together."""
 
 
 def find_features(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
@@ -103,6 +110,7 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
         "side": config.side,
         "masks": str(place.masks) if state.masks else "",
     }
+    state.seconds.pop("features", None)
     _run(place, state, config, job, lambda: count_rows(place.database)[0], len(state.images), progress)
     state.done["features"] = key
     state.save(place)
@@ -130,21 +138,42 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
         # Neighbours by name help where things look alike everywhere; in a video they are neighbours for
         # certain.
         near = sequential_pairs(len(names), config.overlap if video else _ORDER_NEIGHBOURS)
-
-        def read(image: int) -> Descriptors:
-            return descriptors(place.database, names[image])
-
-        vectors = vlad_vectors(
-            read, len(names), build_vocabulary(read, len(names), VISUAL_WORDS, config.seed)
-        )
-        chosen = sorted({*near, *similar_pairs(vectors, config.neighbours)})
-    listed = place.work / "pairs.txt"
-    write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
-    job = {"step": "matches", "pairs": str(listed)}
-    _run(place, state, config, job, lambda: count_rows(place.database)[1], len(chosen), progress)
+        largest: list[Descriptors] = []
+        for name in names:
+            largest.append(largest_features(place.database, name, LARGEST_FEATURES))
+        shared = shared_features(largest, lambda done, total: progress(done, total, "comparing images"))
+        chosen = sorted({*near, *similar_pairs(shared, config.neighbours)})
+    state.seconds.pop("matches", None)
+    _match(place, state, config, progress, names, chosen)
     state.done["matches"] = key
     state.save(place)
     return kind
+
+
+def _match(
+    place: SceneFolder,
+    state: State,
+    config: SfmConfig,
+    progress: Progress,
+    names: list[str],
+    chosen: list[Pair],
+) -> None:
+    """Match pairs of images that are listed by number; those in the database are left as they are."""
+    listed = place.work / "pairs.txt"
+    write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
+    tried = tried_pairs(place.database)
+    fresh = sum(frozenset((names[a], names[b])) not in tried for a, b in chosen)
+    before = len(chosen) - fresh
+    job = {"step": "matches", "pairs": str(listed)}
+    _run(
+        place,
+        state,
+        config,
+        job,
+        lambda: before + count_rows(place.database)[1] - len(tried),
+        len(chosen),
+        progress,
+    )
 
 
 def find_poses(
@@ -153,16 +182,22 @@ def find_poses(
     """The largest model in `sparse/0`; all of them described. Raises DataError where no two images fit
     together.
     """
-    key = step_key(state.done["matches"], "mapping")
+    # With `auto` lost images are matched once more: the same pairs may end in other poses.
+    key = step_key(state.done["matches"], "mapping" if config.matching == "auto" else "mapping as matched")
     described = place.work / "models" / "models.json"
     if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
         return list(json.loads(described.read_text(encoding="utf-8")))
-    for old in (described.parent, place.work / "models_each", place.work / "models_lenses"):
+    for old in (
+        described.parent,
+        place.work / "models_each",
+        place.work / "models_lenses",
+        place.work / "models_again",
+    ):
         shutil.rmtree(old, ignore_errors=True)
     state.seconds.pop("mapping", None)
     state.seconds.pop("lenses", None)
     state.notes.pop("lenses", None)
-    models = _map(place, state, config, progress, described.parent)
+    models = _map_with_lost(place, state, config, progress, described.parent)
     if config.cameras == "shared":
         models = _with_lenses_told_apart(place, state, config, progress, models)
     # The model appears as a whole: copied beside its place, and renamed.
@@ -246,6 +281,64 @@ def _with_lenses_told_apart(
     finally:
         shutil.rmtree(each, ignore_errors=True)
         shutil.rmtree(told, ignore_errors=True)
+
+
+def _map_with_lost(
+    place: SceneFolder, state: State, config: SfmConfig, progress: Progress, out: Path
+) -> list[dict[str, Any]]:
+    """Reconstruct into a folder; with `auto` once more where images without a pose find partners among all."""
+    try:
+        models = _map(place, state, config, progress, out)
+    except _NothingFitsError:
+        if config.matching != "auto" or not _match_lost(place, state, config, progress, []):
+            raise
+        return _map(place, state, config, progress, out)
+    if config.matching == "auto" and _match_lost(place, state, config, progress, models):
+        return _better_map(place, state, config, progress, models)
+    return models
+
+
+def _match_lost(
+    place: SceneFolder, state: State, config: SfmConfig, progress: Progress, models: list[dict[str, Any]]
+) -> bool:
+    """Match images without a pose in the main model, if there is one, with all others. True where one has found
+    a partner.
+    """
+    names = list(state.images)
+    lost = set(names)
+    if models:
+        lost -= set(models[0]["images"])
+    tried = tried_pairs(place.database)
+    chosen = []
+    for a, b in itertools.combinations(range(len(names)), 2):
+        pair = frozenset((names[a], names[b]))
+        if pair & lost and pair not in tried:
+            chosen.append((a, b))
+    # The nearest in order come first where they are too many.
+    chosen = sorted(sorted(chosen, key=lambda pair: pair[1] - pair[0])[:_MAX_LOST_PAIRS])
+    if not chosen:
+        return False
+    before = MatchTables(place.database).partners.total()
+    _match(place, state, config, progress, names, chosen)
+    state.save(place)
+    return MatchTables(place.database).partners.total() > before
+
+
+def _better_map(
+    place: SceneFolder, state: State, config: SfmConfig, progress: Progress, models: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Reconstruct again, from more matches; the models of before where these pose as many images or more."""
+    main = place.work / "models"
+    again = place.work / "models_again"
+    try:
+        more = _map(place, state, config, progress, again)
+        if not better_models(models, more):
+            return models
+        shutil.rmtree(main)
+        again.rename(main)
+        return more
+    finally:
+        shutil.rmtree(again, ignore_errors=True)
 
 
 def _lost_by_lens(place: SceneFolder, state: State, models: list[dict[str, Any]]) -> bool:
@@ -344,14 +437,11 @@ def _run(
             last = "nothing was said"
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {last}; {place.log} has the rest")
     progress(total, total, what)
-    if name in ("features", "matches"):
-        before = 0.0
-    else:
-        before = state.seconds.get(name, 0.0)
+    before = state.seconds.get(name, 0.0)
     state.seconds[name] = round(before + time.perf_counter() - start, 2)
 
 
-def _nothing_fits(place: SceneFolder, state: State) -> DataError:
+def _nothing_fits(place: SceneFolder, state: State) -> _NothingFitsError:
     """Error for images of which no two fit together, with what is known of the reason."""
     # What the decoders lost comes first: it may be all that is wrong.
     unread = sorted(set(state.images) - set(MatchTables(place.database).features))
@@ -363,7 +453,7 @@ def _nothing_fits(place: SceneFolder, state: State) -> DataError:
             f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}"
         )
     if not lost and still_share(place.database) >= _MIN_STILL_SHARE:
-        return DataError(
+        return _NothingFitsError(
             f"{place.root}: all images fit together, but what they share stands still: seen from the background "
             "the camera never moved, as with an object on a turntable; give masks that are black on the background with "
             "--masks FOLDER (and another --output), or walk around with the camera"
@@ -372,7 +462,7 @@ def _nothing_fits(place: SceneFolder, state: State) -> DataError:
         rest = "no two of the other images fit together"
     else:
         rest = "no two images fit together"
-    return DataError(
+    return _NothingFitsError(
         f"{place.root}: {'; '.join([*lost, rest])}; take more views with more overlap, of places with texture "
         f"({place.log} has COLMAP's words)"
     )

@@ -35,14 +35,14 @@ class SfmConfig:
     side: int = 1600
     """Longest side in pixels at which features are sought; larger images are reduced for that."""
     matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
-    """exhaustive: all with all. sequential: in the order of names or time. similar: with those that look
-    alike, by a vocabulary of the scene's own features, and with their neighbours by name. auto: exhaustive
-    for up to 120 images, else similar, with sequential for videos.
+    """exhaustive: all with all. sequential: in the order of names or time. similar: with those that share most
+    of their 300 largest features, and with their neighbours by name. auto: exhaustive for up to 30 images,
+    else similar, with sequential for videos; images that find no pose are then matched with all.
     """
     overlap: int = 10
     """Neighbours in order that an image is matched with, and 2, 4, 8, ... 2^overlap further on."""
-    neighbours: int = 30
-    """Images alike that an image is matched with."""
+    neighbours: int = 16
+    """Images alike that an image is matched with, by `similar`."""
     threads: int | None = None
     """Threads of COLMAP; none = all cores."""
     gpu: bool = True

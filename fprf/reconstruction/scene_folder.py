@@ -139,6 +139,19 @@ class MatchTables:
                 self.partners[names[second]] += 1
 
 
+def tried_pairs(path: Path) -> set[frozenset[str]]:
+    """Names of the pairs of images that were matched, whether they fit or not."""
+    with reading(path) as base:
+        names = dict(base.execute("SELECT image_id, name FROM images"))
+        pairs = base.execute("SELECT pair_id FROM two_view_geometries").fetchall()
+    found = set()
+    for (pair,) in pairs:
+        first, second = divmod(pair, PAIR_FACTOR)
+        if first in names and second in names:
+            found.add(frozenset((names[first], names[second])))
+    return found
+
+
 def count_rows(path: Path) -> tuple[int, int]:
     """Images with features and pairs that were tried so far; zeros while the database cannot be read."""
     with contextlib.suppress(sqlite3.Error, OSError), reading(path) as base:

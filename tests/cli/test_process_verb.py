@@ -172,6 +172,31 @@ def test_similar_matching_reads_the_features(photos: Path) -> None:
     assert 30 * 3 / 2 <= matched < 30 * 29 / 2
 
 
+def test_images_without_a_pose_are_matched_with_all_others(photos: Path) -> None:
+    """33 images are too many to match all pairs at first; 1.png fits only 20.png."""
+    for k in range(5, 33):
+        add(photos, k)
+    plan = {"needs": {"1.png": "20.png"}}
+    assert process(photos, "--matching", "similar", "--neighbours", "1", plan=plan) == 0
+    assert report(photos)["images"]["posed"] == 32
+    calls(photos)
+    assert process(photos, "--neighbours", "1", plan=plan) == 0
+    mapping, rest, again = calls(photos)
+    assert mapping == again == "mapping"
+    assert 20 <= int(rest.removeprefix("matches ")) <= 31, "those of 1.png that were not tried"
+    assert report(photos)["images"]["posed"] == 33 and report(photos)["dropped"] == []
+    assert process(photos, "--neighbours", "1", plan=plan) == 0 and calls(photos) == []
+
+
+def test_all_pairs_are_matched_where_no_two_of_the_first_fit(photos: Path) -> None:
+    for k in range(5, 33):
+        add(photos, k)
+    # Nothing fits before images are matched with one half of the row away.
+    needs = {f"{k}.png": f"{(k + 16) % 33}.png" for k in range(33)}
+    assert process(photos, "--neighbours", "1", plan={"needs": needs}) == 0
+    assert report(photos)["images"]["posed"] == 33
+
+
 def test_photographs_from_nearly_one_place_find_their_poses_too(photos: Path) -> None:
     """No first pair has the angle that COLMAP asks for (4 degrees at its least): smaller ones are tried."""
     assert process(photos, plan={"angle": 1.0}) == 0

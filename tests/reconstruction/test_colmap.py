@@ -16,16 +16,11 @@ from benchmarks.town.write import write_town
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
-from fprf.reconstruction.pairs import (
-    build_vocabulary,
-    descriptors,
-    sequential_pairs,
-    similar_pairs,
-    vlad_vectors,
-)
-from fprf.reconstruction.scene_folder import MatchTables, count_rows, report
+from fprf.reconstruction.pairs import largest_features, sequential_pairs, shared_features, similar_pairs
+from fprf.reconstruction.scene_folder import MatchTables, count_rows, report, tried_pairs
 
 MOST = 2147483647
+TRIED = (("a", "sub/c"), ("sub/c", "lonely"), ("a", "odd"), ("sub/c", "odd"))
 
 
 def misses(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -57,7 +52,11 @@ def database(tmp_path: Path) -> Path:
         INSERT INTO images VALUES (1, 'a', 1), (2, 'b', 1), (5, 'sub/c', 1), (9, 'lonely', 1), (10, 'odd', 1);
         INSERT INTO keypoints VALUES (1, 70, 6, ''), (2, 0, 6, ''), (5, 60, 6, ''), (9, 50, 6, ''), (10, 40, 6, '');"""
     )
-    base.execute("INSERT INTO descriptors VALUES (1, 2, 128, ?)", (bytes(range(128)) * 2,))
+    # The third of a's features is the largest, the first the next: its frame is turned and mirrored.
+    frames = np.array([[0, 0, 0, 3, 3, 0], [0, 0, 1, 0, 0, 2], [0, 0, 4, 1, 1, -4]], np.float32)
+    described = np.arange(3 * 128, dtype=np.uint8).reshape(3, 128)
+    base.execute("UPDATE keypoints SET rows = 3, data = ? WHERE image_id = 1", (frames.tobytes(),))
+    base.execute("INSERT INTO descriptors VALUES (1, 3, 128, ?)", (described.tobytes(),))
     pairs = {(1, 5): 30, (5, 9): 5, (1, 10): 30, (5, 10): 30, (7, 8): 50}
     base.executemany(
         "INSERT INTO two_view_geometries VALUES (?, ?)", [(a * MOST + b, n) for (a, b), n in pairs.items()]
@@ -69,8 +68,11 @@ def database(tmp_path: Path) -> Path:
 
 def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
     assert count_rows(database) == (5, 5)
-    assert np.array_equal(descriptors(database, "a"), np.arange(128, dtype=np.uint8)[None].repeat(2, 0))
-    assert descriptors(database, "b").shape == (0, 128)
+    described = np.arange(3 * 128, dtype=np.uint8).reshape(3, 128)
+    assert np.array_equal(largest_features(database, "a", 2), described[[2, 0]])
+    assert np.array_equal(largest_features(database, "a", 9), described[[2, 0, 1]])
+    assert largest_features(database, "b", 9).shape == (0, 128)
+    assert tried_pairs(database) == {frozenset(each) for each in TRIED}
     assert count_rows(tmp_path / "absent.db") == (0, 0) and not (tmp_path / "absent.db").exists()
     (tmp_path / "other.db").write_bytes(b"no database at all" * 99)
     assert count_rows(tmp_path / "other.db") == (0, 0)
@@ -119,22 +121,38 @@ def test_sequential_reaches_neighbours_and_powers_of_two(count: int, overlap: in
 
 @settings(deadline=None)
 @given(st.integers(0, 20), st.integers(1, 8), st.integers(0, 99))
-def test_similar_finds_the_nearest_by_angle(count: int, nearest: int, seed: int) -> None:
-    vectors = np.random.default_rng(seed).normal(size=(count, 6)).astype(np.float32)
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    pairs = similar_pairs(vectors, nearest)
+def test_similar_finds_those_that_share_most(count: int, nearest: int, seed: int) -> None:
+    order = 1 + np.random.default_rng(seed).permutation(count * count)
+    drawn = np.triu(order.reshape(count, count), 1)
+    shared = drawn + drawn.T
+    pairs = similar_pairs(shared, nearest)
     assert proper(pairs, count)
     for a in range(count):
-        others = sorted((b for b in range(count) if b != a), key=lambda b: -float(vectors[a] @ vectors[b]))
+        others = sorted((b for b in range(count) if b != a), key=lambda b: -shared[a, b])
         assert all((min(a, b), max(a, b)) in pairs for b in others[:nearest])
 
 
-def test_images_of_one_place_are_alike() -> None:
+def test_a_walk_that_comes_back_is_closed() -> None:
+    """Forty images in a row share many features with the next ones; the last ten see what the first ten saw."""
+    place = np.array([*range(40), *range(10)])
+    apart = np.abs(place[:, None] - place[None])
+    shared = np.where(apart < 5, 100 - 20 * apart, 0)
+    again = np.abs(np.arange(50)[:, None] - np.arange(50)[None]) >= 40
+    shared[again] //= 6  # seen from the other side: fewer than any of the nearest four
+    np.fill_diagonal(shared, 0)
+    pairs = similar_pairs(shared, 4)
+    closing = [(a, b) for a, b in pairs if b - a >= 40]
+    assert len(closing) >= 6 and len(pairs) < 50 * 4
+    lonely = np.zeros((5, 5), np.int64)
+    assert similar_pairs(lonely, 3) == []
+
+
+def test_shared_features_are_counted_as_one_by_one() -> None:
     """Eight places, three images of each: a place has features of its own, seen with noise and among
     others.
     """
     drawn = np.random.default_rng(0)
-    images = []
+    images = [np.zeros((0, 128), np.uint8)]
     for _ in range(8):
         own = drawn.gamma(0.6, 40, (120, 128))
         for _ in range(3):
@@ -142,13 +160,25 @@ def test_images_of_one_place_are_alike() -> None:
             images.append(
                 np.concatenate([seen, drawn.gamma(0.6, 40, (30, 128))]).clip(0, 255).astype(np.uint8)
             )
-    vocabulary = build_vocabulary(lambda i: images[i], len(images), 16)
-    found = vlad_vectors(lambda i: images[i], len(images), vocabulary)
-    assert vocabulary.shape == (16, 128) and found.shape == (24, 16 * 128)
-    assert np.allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
-    pairs = similar_pairs(found, 2)
-    same = [(a, b) for a in range(24) for b in range(a + 1, 24) if a // 3 == b // 3]
-    assert len(set(pairs) & set(same)) >= 0.9 * len(same), "of each image's two nearest"
+    told: list[tuple[int, int]] = []
+    shared = shared_features(images, lambda done, total: told.append((done, total)))
+    assert told[-1] == (25, 25) and np.array_equal(shared, shared.T)
+    assert not shared[0].any() and not shared.diagonal().any()
+    place = (np.arange(25) + 2) // 3
+    same = (place[:, None] == place[None]) & (np.arange(25)[:, None] != np.arange(25)[None])
+    assert shared[same].min() > 30 > 5 > shared[~same].max()
+    # One pair, one feature at a time, in float64.
+    a, b = (
+        each.astype(np.float64) / np.linalg.norm(each.astype(np.float64), axis=1)[:, None]
+        for each in images[1:3]
+    )
+    angle = np.arccos((a @ b.T).clip(-1, 1))
+    count = 0
+    for row in range(len(a)):
+        first, second = np.argsort(angle[row])[:2]
+        count += angle[row, first] < 0.8 * angle[row, second] and np.argmin(angle[:, first]) == row
+    assert shared[1, 2] == count
+    assert {(a, b) for a, b in similar_pairs(shared, 2)} == {(a, b) for a, b in np.argwhere(same) if a < b}
 
 
 pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed (extra sfm)")

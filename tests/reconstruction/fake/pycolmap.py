@@ -3,7 +3,8 @@ row.
 
 `fake.json` beside the database steers it: {"bare": images without features, "lonely": images that match
 nothing, "apart": images that end in a second model, "angle": degrees between the rays of any two images, at
-most, "unposed": images without a pose, "fail": a step that ends the process}. What was done is written to
+most, "unposed": images without a pose, "needs": {image without a pose: the one that it has to be matched with},
+"fail": a step that ends the process}. What was done is written to
 `calls.txt` there.
 """
 
@@ -26,7 +27,12 @@ CameraMode = Enum("CameraMode", ["SINGLE"])
 FeatureExtractionOptions = lambda: SimpleNamespace(max_image_size=-1, num_threads=-1, sift=SimpleNamespace())  # noqa: E731
 ImageReaderOptions = FeatureMatchingOptions = ImportedPairingOptions = SimpleNamespace
 TwoViewGeometryOptions = SimpleNamespace
-IncrementalPipelineOptions = lambda: SimpleNamespace(mapper=SimpleNamespace(init_min_tri_angle=16.0))  # noqa: E731
+IncrementalPipelineOptions = lambda: SimpleNamespace(  # noqa: E731
+    mapper=SimpleNamespace(init_min_tri_angle=16.0, filter_max_reproj_error=4.0, filter_min_tri_angle=1.5)
+)
+BundleAdjustmentOptions = lambda: SimpleNamespace(ceres=SimpleNamespace(solver_options=SimpleNamespace()))  # noqa: E731
+bundle_adjustment = lambda model, options: None  # noqa: E731
+ObservationManager = lambda model: SimpleNamespace(filter_all_points3D=lambda error, angle: 0)  # noqa: E731
 
 
 def set_random_seed(seed):
@@ -95,7 +101,8 @@ def extract_features(
             ).lastrowid
             rows = 0 if name in bare else 50
             noise = np.random.default_rng(id_).integers(0, 255, (rows, 128), dtype=np.uint8)
-            base.base.execute("INSERT INTO keypoints VALUES (?, ?, 6, ?)", (id_, rows, b""))
+            places = np.ones((rows, 6), np.float32)
+            base.base.execute("INSERT INTO keypoints VALUES (?, ?, 6, ?)", (id_, rows, places.tobytes()))
             base.base.execute("INSERT INTO descriptors VALUES (?, ?, 128, ?)", (id_, rows, noise.tobytes()))
 
 
@@ -125,6 +132,8 @@ class _Model:
     image = lambda self, id_: SimpleNamespace(name=self.names[id_])  # noqa: E731
     compute_mean_reprojection_error = lambda self: 0.5  # noqa: E731
     compute_mean_track_length = lambda self: 3.0  # noqa: E731
+    update_point_3d_errors = lambda self: None  # noqa: E731
+    extract_colors_for_all_images = lambda self, folder, threads: None  # noqa: E731
 
     def write_binary(self, folder):
         folder = Path(folder)
@@ -153,10 +162,19 @@ def incremental_mapping(database, images, out, options, *, initial_image_pair_ca
     plan = _plan(database)
     with Database.open(database) as base:
         sizes = {name: size for name, *size in base.base.execute("SELECT name, w, h FROM images")}
+        ids = {image.name: image.image_id for image in base.read_all_images()}
+        matched = {
+            divmod(pair, 2147483647)
+            for (pair,) in base.base.execute("SELECT pair_id FROM two_view_geometries")
+        }
+    needing = set()
+    for name, partner in plan.get("needs", {}).items():
+        if tuple(sorted((ids[name], ids[partner]))) not in matched:
+            needing.add(name)
     names = list(sizes)
     lost = {name for key in ("bare", "lonely", "apart", "unposed") for name in plan.get(key, [])}
-    main = [name for name in names if name not in lost]
-    if plan.get("nothing") or plan.get("angle", 180) < options.mapper.init_min_tri_angle / 4:
+    main = [name for name in names if name not in lost | needing]
+    if plan.get("nothing") or len(main) < 2 or plan.get("angle", 180) < options.mapper.init_min_tri_angle / 4:
         return {}
     initial_image_pair_callback()
     for _ in main[2:]:
