@@ -74,7 +74,7 @@ def main(argv: list[str]) -> int:
         if kept:
             figures = {**figures, DERIVED: kept}
     made = Origin(
-        commit=commit(ROOT) or "no checkout",
+        commit=_short(commit(ROOT)),
         command=command,
         date=datetime.now(UTC).date().isoformat(),
         sources=tuple(sources),
@@ -83,6 +83,13 @@ def main(argv: list[str]) -> int:
     write_json(path, document(made, figures))
     print(path)
     return 0
+
+
+def _short(found: str | None) -> str:
+    """A commit in eight digits, with `+` where the checkout had changes. Raises UsageError outside of a checkout."""
+    if found is None:
+        raise UsageError("no commit: results are recorded in a checkout of the repository")
+    return found[:8] + ("+" if found.endswith("+") else "")
 
 
 def _origin(path: Path) -> Origin | None:
