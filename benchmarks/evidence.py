@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fprf.errors import DataError
 
@@ -159,6 +159,20 @@ _SCALES = {
     "MB": (1.0, 1e-6),
 }
 """What a value of a result may be multiplied with to be the figure in that unit."""
+_TIME = r"second|minute|time|(^|/|_)(ms|s|min)(/|$)"
+_KEYS = {
+    "dB": r"psnr|db(/|$)",
+    "ms": _TIME,
+    "s": _TIME,
+    "min": _TIME,
+    "h": _TIME,
+    "MiB": r"mib|bytes",
+    "GiB": r"mib|gib|gb|bytes|rss",
+    "GB": r"mib|gib|gb|bytes|rss",
+    "MB": r"mb|bytes",
+    "rays/s": r"rays|per_second",
+}
+"""Of values that may be the figure in that unit, what one of their keys holds; other units take any."""
 _ROUNDING = 0.51
 """Of the last digit that is printed: a half, and what a value that was itself rounded adds."""
 
@@ -170,14 +184,18 @@ class Figure:
     text: str
     unit: str
 
-    def equals(self, value: float) -> bool:
-        """Whether a result's value, rounded, is this figure; signs do not count."""
+    def equals(self, value: "Value") -> bool:
+        """Whether a result's value, rounded, is this figure; signs do not count. Keys of another unit rule
+        it out.
+        """
+        if value.keys and not re.search(_KEYS.get(self.unit, ""), value.keys.lower()):
+            return False
         digits = self.text.replace(" ", "").lstrip("−-")
         last = 10.0 ** -len(digits.partition(".")[2])
         if " " in self.text:
             last = 10.0 ** (len(digits) - len(digits.rstrip("0")))
         return any(
-            abs(abs(value) * scale - float(digits)) <= _ROUNDING * last
+            abs(abs(value.number) * scale - float(digits)) <= _ROUNDING * last
             for scale in _SCALES.get(self.unit, (1.0,))
         )
 
@@ -205,21 +223,31 @@ def figures(block: str) -> Iterator[Figure]:
             yield Figure(number, unit)
 
 
-def values(found: Any) -> Iterator[float]:
+class Value(NamedTuple):
+    """A number of a result."""
+
+    number: float
+    keys: str
+    """Under which it stands, as KEY/KEY; empty within a text."""
+
+
+def values(found: Any, keys: str = "") -> Iterator[Value]:
     """All numbers of a part of a result, also those within texts."""
     if isinstance(found, dict):
-        for each in found.values():
-            yield from values(each)
+        unit = found.get("unit")
+        for name, each in found.items():
+            told = unit if unit and name in ("figure", "low", "high", "peer", "measured", "bound") else name
+            yield from values(each, f"{keys}/{told}")
     elif isinstance(found, list):
         for each in found:
-            yield from values(each)
+            yield from values(each, keys)
     elif isinstance(found, str):
-        yield from map(float, re.findall(r"\d+\.?\d*", found))
+        yield from (Value(float(number), "") for number in re.findall(r"\d+\.?\d*", found))
     elif isinstance(found, int | float) and not isinstance(found, bool):
-        yield found
+        yield Value(found, keys)
 
 
-def quoted(name: str, root: Path = ROOT) -> list[float]:
+def quoted(name: str, root: Path = ROOT) -> list[Value]:
     """Numbers that a paragraph with `<!-- of: NAME/KEY/... -->` may quote: those of that part, and without a key also what
     `derived` computes and the numbers of the command. Raises DataError for what is not there.
     """
@@ -229,8 +257,8 @@ def quoted(name: str, root: Path = ROOT) -> list[float]:
         raise DataError(f"{name}: no such result in {' or '.join(map(str, FOLDERS))}")
     origin, found = read_result(path)
     if keys:
-        return list(values(part(found, keys, path)))
-    computed = [derived(text, found, path) for text in found.pop(DERIVED, {}).values()]
+        return list(values(part(found, keys, path), "/".join(keys)))
+    computed = [Value(derived(text, found, path), "") for text in found.pop(DERIVED, {}).values()]
     return [*values(found), *values(origin.command), *computed]
 
 

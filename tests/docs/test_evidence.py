@@ -126,9 +126,16 @@ def test_what_is_named_must_be_there(place: Path) -> None:
     assert uncited(place) == ["fox"]
 
 
-def test_digits_that_are_printed_decide() -> None:
-    assert Figure("0.9", "dB").equals(-0.85) and not Figure("0.90", "dB").equals(-0.85)
-    assert Figure("1.6", "GiB").equals(1638.4) and Figure("16", "%").equals(0.1616)
+def test_digits_that_are_printed_and_the_key_decide() -> None:
+    assert Figure("0.9", "dB").equals(Value(-0.85, "psnr")) and not Figure("0.90", "dB").equals(
+        Value(-0.85, "psnr")
+    )
+    assert Figure("1.6", "GiB").equals(Value(1638.4, "peak_rss_mib")) and Figure("16", "%").equals(
+        Value(0.1616, "")
+    )
+    assert not Figure("0.9", "dB").equals(Value(0.9, "ssim")) and Figure("0.90", "").equals(
+        Value(0.9, "ssim")
+    )
 
 
 def test_a_record_names_command_and_sources(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
