@@ -12,6 +12,7 @@ from benchmarks.evidence import (
     ROOT,
     Figure,
     Origin,
+    Value,
     read_result,
     result_files,
     sources_hash,
