@@ -172,7 +172,9 @@ _KEYS = {
     "MB": r"mb|bytes",
     "rays/s": r"rays|per_second",
 }
-"""Of values that may be the figure in that unit, what one of their keys holds; other units take any."""
+"""Of values in that unit, what one of their keys may hold."""
+_OTHER_KEYS = "|".join({*_KEYS.values(), "ssim|lpips|delta_e|share|steps|gaussians(/|$)"})
+"""Of values that have some other unit, or none; keys that say nothing of units rule nothing out."""
 _ROUNDING = 0.51
 """Of the last digit that is printed: a half, and what a value that was itself rounded adds."""
 
@@ -188,7 +190,8 @@ class Figure:
         """Whether a result's value, rounded, is this figure; signs do not count. Keys of another unit rule
         it out.
         """
-        if value.keys and not re.search(_KEYS.get(self.unit, ""), value.keys.lower()):
+        keys = value.keys.lower()
+        if self.unit in _KEYS and not re.search(_KEYS[self.unit], keys) and re.search(_OTHER_KEYS, keys):
             return False
         digits = self.text.replace(" ", "").lstrip("−-")
         last = 10.0 ** -len(digits.partition(".")[2])
