@@ -134,6 +134,17 @@ class ContentField(Regularised):
     ) -> Annotated[Tensor, "M C"]:
         """Content features of some of the points, by their latents and unit viewing directions."""
 
+    def colour(
+        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"], decoder: "Decoder"
+    ) -> Annotated[Tensor, "M 3"]:
+        """sRGB in [0, 1] of these points as they are: their content, decoded.
+
+        Asked where nobody needs the content itself; a field may join its last linear map with the first of
+        the decoder.
+        """
+        rgb: Tensor = decoder(self.content(latent, view))
+        return rgb
+
 
 class SemanticField(Regularised):
     """Points to semantic features, without direction (paper, scene semantic field). Never moves density."""
@@ -180,6 +191,13 @@ class Decoder(nn.Module, ABC):
     @abstractmethod
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         """sRGB in [0, 1], for any features."""
+
+    @property
+    def layers(self) -> "Sequence[tuple[Annotated[Tensor, 'O I'], Annotated[Tensor, 'O'] | None]] | None":
+        """Weights and biases of linear maps with ReLU between them and a sigmoid behind, where that is all that
+        `forward` does; None = it is more.
+        """
+        return None
 
 
 class Stylizer(nn.Module, ABC):

@@ -17,10 +17,11 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from ..interfaces import ContentField, SemanticField
-from ..ops import dense, triplane
+from ..interfaces import ContentField, Decoder, SemanticField
+from ..ops import dense, proposal, triplane
 from ..ops.harmonics import spherical_harmonics
-from ..types import FieldSample
+from ..rendering.space import Space
+from ..types import FieldSample, Rays
 from .config import PlanesConfig, SemanticPlanesConfig
 
 MAX_LOG_DENSITY = 15.0
@@ -110,6 +111,8 @@ class Planes(nn.Module):
 
         One linear map, no network: cheap enough for every sample of every ray, most of which are empty.
         """
+        if dense.usable(points, self.table, weight) and triplane.usable(points, self.table):
+            return triplane.weighed(points, self.table, self.resolutions, weight, limit=MAX_LOG_DENSITY)
         latent = self(points)
         return density(latent @ weight), latent
 
@@ -140,11 +143,36 @@ class PlanesField(ContentField):
         self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]
     ) -> Annotated[Tensor, "M C"]:
         """Content features seen from a direction, f(latent, harmonics(view)) + offset."""
+        maps = weights(self.to_content)
+        return self._network(latent, view, maps, [None] * (len(maps) - 1) + [self.offset])
+
+    def colour(
+        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"], decoder: Decoder
+    ) -> Annotated[Tensor, "M 3"]:
+        """The content, decoded; two linear maps in a row, the last of the content and the first of the
+        decoder, are one.
+        """
+        layers = decoder.layers
+        if layers is None or torch.is_grad_enabled():
+            return super().colour(latent, view, decoder)
+        *maps, last = weights(self.to_content)
+        (first, shift), *rest = layers
+        joined = first @ self.offset
+        if shift is not None:
+            joined = joined + shift
+        biases = [None] * len(maps) + [joined] + [b for _, b in rest]
+        return torch.sigmoid(self._network(latent, view, [*maps, first @ last, *(w for w, _ in rest)], biases))
+
+    def _network(
+        self,
+        latent: Annotated[Tensor, "M L"],
+        view: Annotated[Tensor, "M 3"],
+        maps: list[Tensor],
+        biases: Sequence[Tensor | None],
+    ) -> Annotated[Tensor, "M O"]:
         # Samples of one ray follow each other and share the direction: what it adds is computed once a ray.
         first, run = dense.runs(view)
-        maps = weights(self.to_content)
         shared = spherical_harmonics(view.index_select(0, first), self.degree)
-        biases = [None] * (len(maps) - 1) + [self.offset]
         return dense.network(latent, maps, biases, shared=shared, row=run)
 
     def penalties(self) -> dict[str, Tensor]:
@@ -182,3 +210,30 @@ class ProposalField(nn.Module):
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Density per space unit at points of the unit cube."""
         return self.planes.density(points, self.to_density.weight[0])[0]
+
+    def compiled(self, *given: Tensor) -> bool:
+        """True where `propose` applies to rays and edges: on the CPU, in float32, whole vectors of channels."""
+        return triplane.usable(given[0], self.planes.table) and proposal.usable(*given, learns=False)
+
+    def propose(
+        self,
+        rays: Rays,
+        s: Annotated[Tensor, "R E"],
+        space: Space,
+        count: int,
+        *,
+        padding: float,
+        shift: Annotated[Tensor, "R 1"],
+    ) -> Annotated[Tensor, "R count+1"]:
+        """Edges at even steps of the weights that this density gives to the steps between edges s; nothing
+        learns.
+        """
+        (size,) = self.planes.resolutions
+        return proposal.propose(
+            *(rays.origin, rays.direction, rays.near, rays.far, s, space.warp, self.planes.table, size),
+            self.to_density.weight[0],
+            limit=MAX_LOG_DENSITY,
+            count=count,
+            padding=padding,
+            shift=shift,
+        )

@@ -23,11 +23,13 @@ from .backend import compiled_for
 Floats = np.ndarray[tuple[int], np.dtype[np.float32]]
 
 
-def usable(*tensors: Tensor) -> bool:
-    """Return whether kernels without gradients apply: float32 on the CPU, not empty, gradients disabled,
-    numba installed.
+def usable(*tensors: Tensor, learns: bool | None = None) -> bool:
+    """Return whether kernels without gradients apply: float32 on the CPU, not empty, numba installed, and
+    nothing `learns` (None = as gradients are enabled).
     """
-    return compiled_for(*tensors) and all(x.numel() > 0 for x in tensors) and not torch.is_grad_enabled()
+    if torch.is_grad_enabled() if learns is None else learns:
+        return False
+    return compiled_for(*tensors) and all(x.numel() > 0 for x in tensors)
 
 
 def array(x: Tensor) -> Floats:

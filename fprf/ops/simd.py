@@ -400,6 +400,11 @@ total = _reduced("fadd", ir.Constant(_FLOAT, 0.0), flags=_ADD_ANYHOW)
 """The sum of the lanes."""
 
 
+def everywhere(number, lanes=LANES):
+    """A number that a reduction of lanes gave, in every lane."""
+    return narrow(_broadcast(number.build, number.value), lanes)
+
+
 @traced
 def lowest_bit(bits):
     """The number of the lowest 1 of an integer other than 0."""

@@ -137,6 +137,29 @@ def lookup(
     return result
 
 
+def weighed(
+    points: Annotated[Tensor, "N 3"],
+    table: Annotated[Tensor, "rows F"],
+    resolutions: Sequence[int],
+    weight: Annotated[Tensor, "scales*F"],
+    *,
+    limit: float,
+) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N scales*F"]]:
+    """exp(min(value . weight - 1, limit)) and the values of `lookup`, in one pass, without gradients.
+
+    Where `usable`. The exponent errs as a sum of scales*F products, the exponential by 4e-7 of itself.
+    """
+    from . import triplane_kernels as kernels
+
+    values = torch.empty(len(points), len(resolutions) * table.shape[1])
+    density = torch.empty(len(points))
+    kernels.weighed(
+        array(points), *_laid_out(table, resolutions), array(weight), np.float32(limit), values.view(-1).numpy(),
+        density.numpy(),
+    )  # fmt: skip
+    return density, values
+
+
 def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
     """`variation_reference`, fused and accumulated in float64 where the device has it."""
     if not usable(table, table):

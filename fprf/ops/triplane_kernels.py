@@ -8,11 +8,28 @@ float32.
 import numba
 import numpy as np
 
-from .simd import BLOCK, NARROW, WIDE, load, narrow, store, traced
+from .simd import (
+    BLOCK,
+    NARROW,
+    WIDE,
+    exp2,
+    load,
+    maximum,
+    minimum,
+    narrow,
+    repeat,
+    splat,
+    store,
+    total,
+    traced,
+)
 from .threads import cached_jit
 
 AXES = ((0, 1), (0, 2), (1, 2))
 """Those of `triplane`, which imports this module."""
+LOG2_E = 1 / np.log(2)
+LEAST_EXPONENT = -87.0
+"""exp(-87) stands for all smaller numbers."""
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
 
@@ -23,7 +40,7 @@ _jit_sum = cached_jit(parallel=True, nogil=True, fastmath={"contract", "reassoc"
 
 
 @numba.njit(inline="always")
-def _cells(points, first, count, size, start, channels, corner, part):
+def cells(points, first, count, size, start, channels, corner, part):
     """For `count` <= BLOCK points: first number of the lower corner's vector in each plane, share of the next
     node per axis.
 
@@ -51,6 +68,20 @@ def _cells(points, first, count, size, start, channels, corner, part):
         corner[2 * BLOCK + n] = (start + 2 * plane + k * size + j) * channels
 
 
+@traced
+def exponential(x, at, limit, count):
+    """x[at :] = exp(min(x[at :] - 1, limit)) for `count` numbers, whole vectors."""
+
+    def step(k, held):
+        raw = minimum(narrow(limit, WIDE), load(x, at + k, WIDE) - 1.0)
+        raw = maximum(splat(x, LEAST_EXPONENT, WIDE), raw)
+        # NaN stays: neither comparison takes it away, and the exponential of bits would.
+        store(x, at + k, exp2(raw * LOG2_E) + raw * 0.0)
+        return held
+
+    repeat(count, [splat(x, 0.0, WIDE)], step, by=WIDE)
+
+
 # The inner steps take several channels at a time: left to the compiler they are 3 times slower on 196 608
 # points, forward and backward. Offsets are in numbers from the start of flat arrays; `step` and `stride` lead
 # to the next node along the row and to the next row; u, v, w are the shares of the next nodes.
@@ -75,6 +106,11 @@ def _samples(table, bases, step, stride, shares):
         values.append(mix(upper, lower, shares[down]))
         slopes.append({across: mix(b - a, d - c, shares[down]), down: lower - upper})
     return values, slopes
+
+
+def samples_of(table, bases, step, stride, shares):
+    """Bilinear samples of the three planes, for other traced functions."""
+    return _samples(table, bases, step, stride, shares)[0]
 
 
 @traced
@@ -121,7 +157,7 @@ def _features(points, first, count, table, channels, sizes, starts, corner, part
     scales = len(sizes)
     for scale in range(scales):
         size = sizes[scale]
-        _cells(points, first, count, size, starts[scale], channels, corner, part)
+        cells(points, first, count, size, starts[scale], channels, corner, part)
         for n in range(count):
             a = corner[n]
             b = corner[BLOCK + n]
@@ -168,6 +204,36 @@ def forward(points, table, channels, sizes, starts, out):
         )
 
 
+@traced
+def dot(x, at, weight, count):
+    """The sum of x[at :] times weight over `count` numbers, whole vectors."""
+
+    def step(k, sums):
+        return [sums[0] + load(x, at + k, NARROW) * load(weight, k, NARROW)]
+
+    (found,) = repeat(count, [splat(x, 0.0, NARROW)], step, by=NARROW)
+    return total(found)
+
+
+@_jit
+def weighed(points, table, channels, sizes, starts, weight, limit, out, density):
+    """`forward`, and density[n] = exp(min(out[n] . weight - 1, limit))."""
+    count = len(points) // 3
+    width = len(sizes) * channels
+    for task in numba.prange((count + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        corner = np.empty(3 * BLOCK, np.int64)
+        part = np.empty(3 * BLOCK, np.float32)
+        rows = min(BLOCK, count - first)
+        raw = np.zeros(BLOCK, np.float32)
+        to = first * width
+        _features(points, first, rows, table, channels, sizes, starts, corner, part, out, to)
+        for n in range(rows):
+            raw[n] = dot(out, to + n * width, weight, width)
+        exponential(raw, 0, limit, BLOCK)
+        density[first : first + rows] = raw[:rows]
+
+
 @_jit
 def backward(points, table, channels, sizes, starts, grad, slices, out):
     """Add the table's gradient to `out` [slices ...]; a task per slice of the points, scale, channel
@@ -190,7 +256,7 @@ def backward(points, table, channels, sizes, starts, grad, slices, out):
         for block in range(part_of * blocks // slices, (part_of + 1) * blocks // slices):
             first = block * BLOCK
             count = min(BLOCK, total - first)
-            _cells(points, first, count, size, starts[scale], channels, corner, part)
+            cells(points, first, count, size, starts[scale], channels, corner, part)
             o = (first * scales + scale) * channels + here
             apart = scales * channels
             for n in range(count):
@@ -260,7 +326,7 @@ def point_slopes(points, table, channels, sizes, starts, grad, out):
             size = sizes[scale]
             half = np.float32(0.5) * np.float32(size - 1)
             last = np.float32(size - 1)
-            _cells(points, first, count, size, starts[scale], channels, corner, part)
+            cells(points, first, count, size, starts[scale], channels, corner, part)
             o = (first * scales + scale) * channels
             apart = scales * channels
             for n in range(count):

@@ -22,7 +22,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..interfaces import Decoder, Parts
+from ..ops import proposal
 from ..types import Rays, Rendered, Sampled, View, Want
+from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
 if TYPE_CHECKING:
@@ -80,8 +82,7 @@ def march(
     scaled = step is not None and space.kind in ("contraction", "open")
     # Densities at the middle of each step, in the unit cube, where the fields live.
     middle = midpoints(sampled.t)
-    points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
-    located = space.locate(points.view(-1, 3))
+    located = _located(rays, sampled.t, middle, space)
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
     scale = None
@@ -120,6 +121,17 @@ def march(
     return March(sampled, weights, depth, opacity, transmittance, kept)
 
 
+def _located(
+    rays: Rays, t: Annotated[Tensor, "R E"], middle: Annotated[Tensor, "R S"], space: Space
+) -> Annotated[Tensor, "R*S 3"]:
+    """The middles of steps in the unit cube."""
+    moving = rays.origin.requires_grad or rays.direction.requires_grad
+    if proposal.usable(rays.origin, rays.direction, t, learns=moving):
+        return proposal.place(rays.origin, rays.direction, t, space.warp)
+    points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
+    return space.locate(points.view(-1, 3))
+
+
 def _detached(rays: Rays) -> Rays:
     """Rays without gradients: neither the places of samples nor semantics shall move a camera's pose."""
     return Rays(*(x.detach() for x in rays))
@@ -135,6 +147,13 @@ def march_features(
     kept = marched.kept
     content = parts.field.content(kept.latent, kept.view)
     return marched, content, parts.semantic(kept.point) if semantic and parts.semantic is not None else None
+
+
+def march_colours(rays: Rays, parts: Parts, *, budget: float) -> tuple[March, Annotated[Tensor, "M 3"]]:
+    """March rays, and evaluate the colours of the kept samples as they are."""
+    marched = march(rays, parts, budget=budget)
+    kept = marched.kept
+    return marched, parts.field.colour(kept.latent, kept.view, parts.decoder)
 
 
 def shade(

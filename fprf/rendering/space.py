@@ -22,6 +22,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
+from ..ops.proposal import Warp
 from ..types import Rays
 
 Kind = Literal["box", "contraction", "ndc", "open"]
@@ -126,6 +127,17 @@ class Space:
         # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative
         # weight.
         return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
+
+    @cached_property
+    def warp(self) -> Warp:
+        """`distance` and `locate` as compiled loops take them."""
+        curved = self.kind in ("contraction", "open")
+        if curved:
+            return Warp(curved, contracted=self.kind == "contraction")
+        factor = []
+        for low, high in zip(self.low, self.high, strict=True):
+            factor.append(2 / (high - low))
+        return Warp(curved, contracted=False, low=self.low, factor=(factor[0], factor[1], factor[2]), offset=1.0)
 
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]

@@ -34,10 +34,11 @@ from typing import TYPE_CHECKING, Annotated
 import torch
 from torch import Tensor, nn
 
+from ..ops import mixture
 from ..ops.backend import double
 from .dictionary import StyleDictionary, choose, code_odds
-from .matching import score_spread, share_mean, unit
-from .scene_style import Membership, SceneStyle
+from .matching import no_direction, score_spread, share_mean, unit
+from .scene_style import Membership, SceneStyle, mixed_maps
 
 if TYPE_CHECKING:
     from ..plugins.stylizers.config import StylizerConfig
@@ -161,21 +162,54 @@ class Light(nn.Module):
         """
         belongs = self._belongs(semantic, belongs)
         points = semantic.to(self.keys)
-        # The most like of all references, each by the mean cosine with its nearest codes.
+        # Of references that are forbidden to their regions, points know nothing.
+        lower = 2 * (belongs @ self.forbidden) if self._restricted else None
+        if mixture.usable(points, self.keys, self.middles):
+            own = self._nearest(points, lower)
+        else:
+            own = self._nearest_reference(points, lower)
+        likeness = (own[:, None] / self._spread + belongs @ self.region_likeness) / 2
+        return (likeness / SURE).clamp(0, 1) * (belongs @ self.claim)
+
+    def _nearest_reference(
+        self, points: Annotated[Tensor, "N D"], lower: Annotated[Tensor, "N references"] | None
+    ) -> Annotated[Tensor, "N"]:
+        """The most like of all references, each by the mean cosine with its nearest codes."""
         own = points.new_full((len(points),), -1.0)
         for i, middle in enumerate(self.middles):
-            codes = (self.reference == i).nonzero().squeeze(1)
+            codes = self._codes(i)
             near = cosines(points, self.keys[codes], self.beyond[codes], self.membership.centre, middle)
-            if self._restricted:  # of references that are forbidden to their regions, points know nothing
-                near = near - 2 * (belongs @ self.forbidden[:, i, None])
+            if lower is not None:
+                near = near - lower[:, i, None]
             # From the nearest code on, until a twentieth of the reference's pixels is full; the last one
             # counts in part.
             near, order = near.sort(1, descending=True)
             size = (self.share[codes] / self.share[codes].sum())[order]
             taken = (_NEAREST_SHARE - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
             own = torch.maximum(own, (taken * near).sum(1) / taken.sum(1))
-        likeness = (own[:, None] / self._spread + belongs @ self.region_likeness) / 2
-        return (likeness / SURE).clamp(0, 1) * (belongs @ self.claim)
+        return own
+
+    def _nearest(
+        self, points: Annotated[Tensor, "N D"], lower: Annotated[Tensor, "N references"] | None
+    ) -> Annotated[Tensor, "N"]:
+        """`_nearest_reference`, compiled."""
+        centre = self.membership.centre
+        keys = []
+        aside = []
+        sizes = []
+        for i, middle in enumerate(self.middles):
+            codes = self._codes(i)
+            keys.append(shown_units(self.keys[codes], self.beyond[codes], centre))
+            aside.append(shown_units(self.keys[codes], self.beyond[codes], middle))
+            sizes.append(self.share[codes] / self.share[codes].sum())
+        least = no_direction(torch.cat([centre[None], self.middles]))
+        tables = mixture.nearest_codes(keys, aside, sizes)
+        return mixture.nearest(
+            points, centre, self.middles, tables, least=least, share=_NEAREST_SHARE, lower=lower
+        )
+
+    def _codes(self, reference: int) -> Annotated[Tensor, "codes"]:
+        return (self.reference == reference).nonzero().squeeze(1)
 
     def paint(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
@@ -209,8 +243,10 @@ class Light(nn.Module):
         belongs: Annotated[Tensor, "N K"] | None = None,
     ) -> Annotated[Tensor, "N 3"]:
         """What `change` adds to the scene's own colours."""
-        maps = self.change(semantic, paint, belongs)
-        return (torch.einsum("nc,ncd->nd", colour.to(maps), maps[:, :3]) + maps[:, 3]).to(colour)
+        belongs = self._belongs(semantic, belongs)
+        lit = mixed_maps(colour.to(self.maps), belongs, self.maps[:, :3], self.maps[:, 3])
+        middle = belongs @ self.between
+        return torch.addcmul(lit * (1 - paint), 4 * paint * (1 - paint), middle).to(colour)
 
     def _belongs(self, semantic: Tensor, belongs: Tensor | None) -> Annotated[Tensor, "N K"]:
         if belongs is None:
@@ -294,12 +330,20 @@ def cosines(
     """
 
     def seen(at: Tensor) -> Tensor:
-        # Cosine in all channels from that in the basis: codes are longer by what lies beyond it.
-        length = (keys - at).square().sum(1)
-        shown = (length / (length + beyond).clamp_min(torch.finfo(length.dtype).tiny)).sqrt()
-        return unit(x, at) @ unit(keys, at).T * shown
+        return unit(x, at) @ shown_units(keys, beyond, at).T
 
     return torch.minimum(seen(centre), seen(middle))
+
+
+def shown_units(
+    keys: Annotated[Tensor, "T D"], beyond: Annotated[Tensor, "T"], at: Annotated[Tensor, "D"]
+) -> Annotated[Tensor, "T D"]:
+    """Directions of codes from a place, shorter by what lies `beyond` the basis: a product with a direction
+    in the basis is the cosine in all channels.
+    """
+    length = (keys - at).square().sum(1)
+    shown = (length / (length + beyond).clamp_min(torch.finfo(length.dtype).tiny)).sqrt()
+    return unit(keys, at) * shown[:, None]
 
 
 def _beyond(dictionary: StyleDictionary) -> Annotated[Tensor, "T"]:

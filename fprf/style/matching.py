@@ -30,6 +30,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from ..ops import mixture
 from ..ops.backend import double
 
 _ROUNDING_SHARE = 1e-6
@@ -46,8 +47,12 @@ def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotat
     """
     away = x - centre
     norm = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
-    flat = norm <= _ROUNDING_SHARE * torch.linalg.vector_norm(centre)
-    return torch.where(flat, 0.0, away / norm.clamp_min(torch.finfo(x.dtype).tiny))
+    return torch.where(norm <= no_direction(centre), 0.0, away / norm.clamp_min(torch.finfo(x.dtype).tiny))
+
+
+def no_direction(centre: Annotated[Tensor, "... D"]) -> Annotated[Tensor, "..."]:
+    """Distance from a centre up to which nothing has a direction: what is left of it is rounding."""
+    return _ROUNDING_SHARE * torch.linalg.vector_norm(centre, dim=-1)
 
 
 def share_mean(keys: Annotated[Tensor, "T D"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "D"]:
@@ -109,6 +114,12 @@ def point_shares(
     Shares below `faint` of a point's largest become 0. Rows sum to 1. Rounding errors are at most
     4 (D + 4) u / temperature, u the unit roundoff of the points' type.
     """
+    given = [each for each in (x, keys, centre, prior) if each is not None]
+    if mixture.usable(*given):
+        least = 0.0 if centre is None else no_direction(centre)
+        return mixture.shares(
+            x, keys, temperature, centre=centre, least=float(least), prior=prior, faint=faint
+        )
     if centre is not None:
         x = unit(x, centre)
     share = attention(x, keys, temperature, prior)

@@ -19,6 +19,7 @@ from ..rendering.renderer import (
     composite_mean,
     enlarged,
     march,
+    march_colours,
     march_features,
     render_rays,
     shade,
@@ -67,6 +68,8 @@ class ViewChunk:
     """Number of samples before the light ones were dropped."""
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factor of the final colours."""
+    plain: Annotated[Tensor, "M 3"] | None = None
+    """Colours as they are, in the place of content where no style is asked for."""
 
     @property
     def bytes(self) -> int:
@@ -77,10 +80,11 @@ class ViewChunk:
     @torch.inference_mode()
     def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
         """Colours of its pixels in a style, or as they are, in [0, 1]."""
-        rgb = (
-            composite(self.kept, shade(decoder, self.content, self.semantic, restyle), self.rays)
-            + self.behind
-        )
+        if self.plain is None:
+            values = shade(decoder, self.content, self.semantic, restyle)
+        else:
+            values = self.plain
+        rgb = composite(self.kept, values, self.rays) + self.behind
         return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1)
 
     @torch.inference_mode()
@@ -91,20 +95,34 @@ class ViewChunk:
 
 @torch.inference_mode()
 def view_chunks(
-    model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, *, semantic: bool = True
+    model: Model,
+    facts: Facts,
+    cameras: Cameras,
+    view: int,
+    config: RenderConfig,
+    *,
+    semantic: bool = True,
+    plain: bool = False,
 ) -> Iterator[ViewChunk]:
     """Geometry and features of a view, chunk by chunk of its rays (see `memory.chunk_size`), for any style.
 
-    For those who may stop half-way or keep none. Without `semantic` the semantic field is not evaluated.
+    For those who may stop half-way or keep none. Without `semantic` the semantic field is not evaluated;
+    `plain` is for no style: colours as they are, and no features.
     """
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
 
     def rendered(here: slice) -> ViewChunk:
         chunk = Rays(*(x[here] for x in rays))
-        marched, content, semantics = march_features(
-            chunk, model.parts, budget=config.budget, semantic=semantic
-        )
+        colours = None
+        semantics = None
+        if plain:
+            marched, colours = march_colours(chunk, model.parts, budget=config.budget)
+            content = colours[:, :0]
+        else:
+            marched, content, semantics = march_features(
+                chunk, model.parts, budget=config.budget, semantic=semantic
+            )
         kept = marched.kept
         behind = 0.0 if background is None else marched.transmittance[:, None] * background
         # Points and latents have done their part, and would be most of what is held.
@@ -118,7 +136,7 @@ def view_chunks(
         samples = marched.weights.numel()
         tone = config.tone or (1.0, 1.0, 1.0)
         return ViewChunk(
-            bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone
+            bare, content, semantics, behind, len(chunk.near), metric, marched.opacity, samples, tone, colours
         )
 
     yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), rendered)
@@ -178,8 +196,9 @@ def render_view(
         view = 0
     width, height = cameras.size[view].tolist()
     # Semantics are evaluated only where the style tells places apart by them.
-    semantic = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
-    chunks = view_chunks(model, facts, cameras, view, config, semantic=semantic)
+    plain = restyle is None or restyle.idle
+    semantic = restyle is not None and not plain and Want.SEMANTIC in restyle.needs
+    chunks = view_chunks(model, facts, cameras, view, config, semantic=semantic, plain=plain)
     shown = _view_of(chunks, model.decoder, restyle, (height, width))
     return _on_host(enlarged(shown, whole) if config.resolution < 1 else shown)
 

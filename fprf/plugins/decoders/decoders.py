@@ -29,8 +29,12 @@ class MlpDecoder(Decoder):
 
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         """sRGB in [0, 1]."""
-        maps = (self.first, self.second)
-        return torch.sigmoid(dense.network(content, [m.weight for m in maps], [m.bias for m in maps]))
+        maps = self.layers
+        return torch.sigmoid(dense.network(content, [w for w, _ in maps], [b for _, b in maps]))
+
+    @property
+    def layers(self) -> tuple[tuple[Tensor, Tensor], ...]:
+        return (self.first.weight, self.first.bias), (self.second.weight, self.second.bias)
 
 
 def load_decoder(

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from ...fields.planes import ProposalField
 from ...interfaces import Sampler
 from ...rendering.space import Space
-from ...rendering.stepfun import midpoints, resample, transmittance_weights
+from ...rendering.stepfun import midpoints, resample, shifts, transmittance_weights
 from ...types import Level, Rays, Sampled
 from .config import ProposalConfig
 
@@ -50,6 +50,13 @@ class ProposalSampler(Sampler):
         sharpness = 1.0 if step is None else self.sharpness(step)
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
+            # A scene of blocks has fields of its own in the place of these.
+            own = field if isinstance(field, ProposalField) else None
+            if own is not None and not learns and sharpness == 1 and own.compiled(rays.origin, s):
+                s = own.propose(
+                    rays, s, space, count, padding=self.config.padding, shift=shifts(s, generator)
+                )
+                continue
             with torch.set_grad_enabled(learns):
                 t = space.distance(s, rays.near, rays.far)
                 points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]

@@ -19,7 +19,7 @@ from ...interfaces import Stylizer
 from ...ops.backend import double
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import point_shares, score_spread, share_mean, unit
-from ...style.scene_style import SceneStyle, check_fit
+from ...style.scene_style import SceneStyle, check_fit, mixed_gains
 from ...style.statistics import deviation
 from ...types import Want
 from .config import LocalAdainConfig
@@ -108,7 +108,7 @@ class AdainStylizer(Stylizer):
         if self.matched:
             assert semantic is not None, "Want.SEMANTIC was asked for"
             share = self.match(semantic)
-            styled = (features - self.content_mean) * (share @ self.gain) + share @ self.style_mean
+            styled = mixed_gains(features, self.content_mean, share, self.gain, self.style_mean)
         else:
             styled = (features - self.content_mean) * self.gain + self.style_mean
         return styled.to(content)

@@ -22,7 +22,7 @@ from ...interfaces import Stylizer
 from ...ops.backend import double
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import match_keys, unit
-from ...style.scene_style import Membership, SceneStyle, check_fit, mixed_maps, own_style
+from ...style.scene_style import Membership, SceneStyle, check_fit, mixed_gains, mixed_maps, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
 from .config import RegionConfig
@@ -151,11 +151,11 @@ class TwoSidedStylizer(Stylizer):
     ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"]]:
         """`forward`, and the regions that points belong to."""
         share = self.membership(content[:, :0] if semantic is None else semantic)
-        away = content.to(self.centre) - self.centre
-        if self.matrix.ndim == 2:  # gains and biases are mixed before they are applied
-            styled = away * (share @ self.matrix) + share @ self.bias
+        features = content.to(self.centre)
+        if self.matrix.ndim == 2:
+            styled = mixed_gains(features, self.centre, share, self.matrix, self.bias)
         else:
-            styled = mixed_maps(away, share, self.matrix, self.bias)
+            styled = mixed_maps(features, share, self.matrix, self.bias, centre=self.centre)
         return styled.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
