@@ -23,7 +23,7 @@ class Benchmark(NamedTuple):
     """Flags that `--quick` stands for: the whole way, in about a minute, with figures that mean nothing.
 
     {town} is the folder of a small town, {run} a short training of a tiny model on it, {folder} one that is
-    thrown away.
+    thrown away, {results} that of the results of this repository.
     """
     needs: str = "nothing but fprf"
     """Data, extras and time; said before it starts."""
@@ -31,9 +31,16 @@ class Benchmark(NamedTuple):
     """Modules that must be there."""
 
 
+RESULTS = Path(__file__).parent / "results"
+"""Figures that the documents show."""
 _RUN = "{run} --repeats 1 --rays 256 --device cpu"
 _TRAINED = "a run of fields; without one it trains fprf-lite on the town first"
 BENCHMARKS = {
+    "compare": Benchmark(
+        "two results of one benchmark; fails where the new one has lost a tenth",
+        "{results}/speed_fox.json {results}/speed_fox.json",
+        "two JSON files",
+    ),
     "exports": Benchmark(
         "exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED
     ),
@@ -163,7 +170,7 @@ def main(args: list[str]) -> int:
                     train(
                         replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite"
                     )
-                flags = [*shlex.split(chosen.quick.format(town=town, run=run, folder=folder)), *flags]
+                flags = [*shlex.split(chosen.quick.format(town=town, run=run, folder=folder, results=RESULTS)), *flags]
             return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)

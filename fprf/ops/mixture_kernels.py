@@ -87,7 +87,7 @@ def softmax(score, at, factor, padding, odds, sharpness, faint, width):
         return [maximum(scaled, held[0])]
 
     def weigh(k, held):
-        logit = (load(score, at + k, WIDE) - best) * sharpness + load(odds, k, WIDE)
+        logit = maximum(lowest, (load(score, at + k, WIDE) - best) * sharpness + load(odds, k, WIDE))
         store(score, at + k, logit)
         return [maximum(logit, held[0])]
 

@@ -34,9 +34,8 @@ GROUP = 16
 """Channels of one backward task: a cache line of float32."""
 
 _jit = cached_jit(parallel=True, nogil=True)
-# Differences of neighbours may be summed in any order inside a row: the sum is a regulariser, kept in
-# float64.
-_jit_sum = cached_jit(parallel=True, nogil=True, fastmath={"contract", "reassoc"})
+_PIECE = 512
+"""Squares that are added in float32, 64 a lane, before float64 takes them: a regulariser needs no more."""
 
 
 @numba.njit(inline="always")
@@ -361,27 +360,57 @@ def point_slopes(points, table, channels, sizes, starts, grad, out):
                         out[3 * (first + n) + axis] += half * slope
 
 
-@_jit_sum
+@traced
+def difference(table, at, step, count):
+    """The sum of the squares of table[at + step :] - table[at :] over `count` numbers, whole vectors."""
+
+    def add(k, sums):
+        apart = load(table, at + step + k, NARROW) - load(table, at + k, NARROW)
+        return [sums[0] + apart * apart]
+
+    (found,) = repeat(count, [splat(table, 0.0, NARROW)], add, by=NARROW)
+    return total(found)
+
+
+@numba.njit(inline="always")
+def _differences(table, first, step, count):
+    """`difference` of any length, its pieces added in float64."""
+    line = 0.0
+    for at in range(0, count, _PIECE):
+        line += difference(table, first + at, step, min(_PIECE, count - at))
+    return line
+
+
+@_jit
 def variation(table, channels, sizes, starts):
     """Sum over scales of the mean squared difference of neighbours across, and down."""
-    total = 0.0
+    whole = 0.0
     for scale in range(len(sizes)):
         size = sizes[scale]
+        width = size * channels
         part = 0.0
         for row in numba.prange(3 * size):
             first = (starts[scale] + row * size) * channels
-            width = size * channels
-            line = 0.0
-            for x in range(first, first + width - channels):
-                across = table[x + channels] - table[x]
-                line += across * across
+            line = _differences(table, first, channels, width - channels)
             if row % size < size - 1:
-                for x in range(first, first + width):
-                    down = table[x + width] - table[x]
-                    line += down * down
+                line += _differences(table, first, width, width)
             part += line
-        total += part / (3.0 * size * (size - 1) * channels)
-    return total
+        whole += part / (3.0 * size * (size - 1) * channels)
+    return whole
+
+
+@traced
+def apart_from_neighbours(table, at, west, east, north, south, factor, out, count):
+    """out[at :] = factor (4 table[at :] - those at four offsets) for `count` numbers, whole vectors."""
+
+    def step(k, held):
+        x = at + k
+        beside = load(table, x - west, NARROW) + load(table, x + east, NARROW)
+        above = load(table, x - north, NARROW) + load(table, x + south, NARROW)
+        store(out, x, narrow(factor, NARROW) * (4.0 * load(table, x, NARROW) - (beside + above)))
+        return held
+
+    repeat(count, [splat(table, 0.0, NARROW)], step, by=NARROW)
 
 
 @_jit
@@ -396,11 +425,12 @@ def variation_gradient(table, channels, sizes, starts, scale, out):
         for row in numba.prange(3 * size):
             v = row % size
             first = (starts[s] + row * size) * channels
+            last = first + width - channels
             north = width if v > 0 else 0
             south = width if v < size - 1 else 0
-            for u in range(size):
-                west = channels if u > 0 else 0
-                east = channels if u < size - 1 else 0
-                for x in range(first + u * channels, first + (u + 1) * channels):
-                    near = table[x - west] + table[x + east] + table[x - north] + table[x + south]
-                    out[x] = factor * (np.float32(4) * table[x] - near)
+            inner = first + channels
+            apart_from_neighbours(table, first, 0, channels, north, south, factor, out, channels)
+            apart_from_neighbours(
+                table, inner, channels, channels, north, south, factor, out, last - inner
+            )
+            apart_from_neighbours(table, last, channels, 0, north, south, factor, out, channels)
