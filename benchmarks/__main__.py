@@ -170,7 +170,10 @@ def main(args: list[str]) -> int:
                     train(
                         replace(tiny(town, steps=20), output=Path(run), checkpoint_minutes=5.0), "fprf-lite"
                     )
-                flags = [*shlex.split(chosen.quick.format(town=town, run=run, folder=folder, results=RESULTS)), *flags]
+                flags = [
+                    *shlex.split(chosen.quick.format(town=town, run=run, folder=folder, results=RESULTS)),
+                    *flags,
+                ]
             return importlib.import_module(f".{name}", __package__).main(flags) or 0
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -123,6 +123,8 @@ def _read(path: Path) -> dict[str, Any]:
     except ValueError as problem:
         raise DataError(f"{path}: no JSON ({problem}); name a result of a benchmark (--output)") from problem
     rows = found.get("rows") if isinstance(found, dict) else None
-    if not isinstance(rows, list) or not all(isinstance(r, dict) and {"name", "figure", "unit"} <= set(r) for r in rows):
+    if not isinstance(rows, list) or not all(
+        isinstance(r, dict) and {"name", "figure", "unit"} <= set(r) for r in rows
+    ):
         raise DataError(f"{path}: no rows with name, figure and unit; name a result such as that of speed")
     return found

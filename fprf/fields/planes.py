@@ -161,7 +161,9 @@ class PlanesField(ContentField):
         if shift is not None:
             joined = joined + shift
         biases = [None] * len(maps) + [joined] + [b for _, b in rest]
-        return torch.sigmoid(self._network(latent, view, [*maps, first @ last, *(w for w, _ in rest)], biases))
+        return torch.sigmoid(
+            self._network(latent, view, [*maps, first @ last, *(w for w, _ in rest)], biases)
+        )
 
     def _network(
         self,

@@ -308,7 +308,20 @@ def lesser(score, at, seen, factor, other, padding, p_at, width):
 
 @_jit
 def nearest(
-    x, centre, least, middles, least_middles, codes, keys, middle_keys, width, padding, sizes, share, lower, out
+    x,
+    centre,
+    least,
+    middles,
+    least_middles,
+    codes,
+    keys,
+    middle_keys,
+    width,
+    padding,
+    sizes,
+    share,
+    lower,
+    out,
 ):
     """out [N] = over all references the largest mean cosine of a point with its nearest codes.
 

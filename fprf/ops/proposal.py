@@ -64,7 +64,10 @@ def propose(
 
 
 def place(
-    origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R E"], warp: Warp
+    origin: Annotated[Tensor, "R 3"],
+    direction: Annotated[Tensor, "R 3"],
+    t: Annotated[Tensor, "R E"],
+    warp: Warp,
 ) -> Annotated[Tensor, "R*S 3"]:
     """Middles of the steps between edges, in the unit cube."""
     from . import proposal_kernels as kernels

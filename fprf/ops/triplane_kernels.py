@@ -430,7 +430,5 @@ def variation_gradient(table, channels, sizes, starts, scale, out):
             south = width if v < size - 1 else 0
             inner = first + channels
             apart_from_neighbours(table, first, 0, channels, north, south, factor, out, channels)
-            apart_from_neighbours(
-                table, inner, channels, channels, north, south, factor, out, last - inner
-            )
+            apart_from_neighbours(table, inner, channels, channels, north, south, factor, out, last - inner)
             apart_from_neighbours(table, last, channels, 0, north, south, factor, out, channels)

@@ -137,7 +137,9 @@ class Space:
         factor = []
         for low, high in zip(self.low, self.high, strict=True):
             factor.append(2 / (high - low))
-        return Warp(curved, contracted=False, low=self.low, factor=(factor[0], factor[1], factor[2]), offset=1.0)
+        return Warp(
+            curved, contracted=False, low=self.low, factor=(factor[0], factor[1], factor[2]), offset=1.0
+        )
 
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]
