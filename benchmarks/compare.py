@@ -127,4 +127,5 @@ def _read(path: Path) -> dict[str, Any]:
         isinstance(r, dict) and {"name", "figure", "unit"} <= set(r) for r in rows
     ):
         raise DataError(f"{path}: no rows with name, figure and unit; name a result such as that of speed")
-    return found
+    result: dict[str, Any] = found
+    return result

@@ -40,16 +40,16 @@ def shares(
     count = len(keys)
     table = _padded(keys.T)
     width = table.shape[1]
-    padding = keys.new_full((width,), _NO_KEY)
-    padding[:count] = 0
-    odds = keys.new_zeros(width)
+    odds = keys.new_zeros(2, width)
+    odds[0, count:] = _NO_KEY
     if prior is not None:
-        odds[:count] = prior.log()
+        odds[1, :count] = prior.log()
+    sharpness = 1 / max(temperature, torch.finfo(torch.float32).tiny)
     out = torch.empty(len(x), count)
     kernels.attention(
         array(x), array(torch.zeros_like(keys[0]) if centre is None else centre),
-        np.float32(-1 if centre is None else least), array(table), width, array(padding), array(odds),
-        np.float32(1 / max(temperature, torch.finfo(torch.float32).tiny)), np.float32(faint), out.view(-1).numpy(),
+        np.float32(-1 if centre is None else least), array(table), array(odds),
+        (np.float32(sharpness), np.float32(faint)), out.view(-1).numpy(),
     )  # fmt: skip
     return out
 
@@ -65,9 +65,10 @@ def scaled(
     from . import mixture_kernels as kernels
 
     gains = _padded(gain)
+    table = torch.cat([gains, _padded(bias)], 1)
     out = torch.empty_like(x, memory_format=torch.contiguous_format)
     kernels.scaled(
-        array(x), array(centre), array(share), array(gains), array(_padded(bias)), gains.shape[1], out.view(-1).numpy()
+        array(x), array(centre), array(share), array(table), gains.shape[1], out.view(-1).numpy()
     )  # fmt: skip
     return out
 
@@ -82,12 +83,10 @@ def affine(
     """sum_k share_k ((x - centre) matrix_k + bias_k); maps without a share are not computed."""
     from . import mixture_kernels as kernels
 
-    shifts = _padded(bias)
-    width = shifts.shape[1]
+    maps = _padded(torch.cat([matrix, bias[:, None]], 1))
+    width = maps.shape[-1]
     out = torch.empty(len(x), width)
-    kernels.affine(
-        array(x), array(centre), array(share), array(_padded(matrix)), array(shifts), width, out.view(-1).numpy()
-    )  # fmt: skip
+    kernels.affine(array(x), array(centre), array(share), array(maps), width, out.view(-1).numpy())
     if width == x.shape[1]:
         return out
     return out[:, : x.shape[1]].contiguous()
@@ -111,17 +110,12 @@ def coloured(
 class NearestCodes(NamedTuple):
     """Codes of references as `nearest` takes them."""
 
-    codes: np.ndarray[tuple[int], np.dtype[np.int64]]
-    """First code of each reference, and behind the last."""
     keys: Floats
-    """Directions of the codes from the centre, times what is shown of each: [references, D, width]."""
-    middle_keys: Floats
-    """The same from the middle of each reference."""
-    padding: Floats
-    """0 for codes, far below any cosine for what fills their place: [references, width]."""
-    sizes: Floats
-    """Share of each code in its reference."""
-    width: int
+    """Directions of the codes from the centre, and from the middle of their reference, times what is shown of
+    each: [2, references, D, width].
+    """
+    table: Floats
+    """0 for codes and far below any cosine for what fills their place; their sizes: [2, references, width]."""
 
 
 def nearest_codes(
@@ -129,41 +123,40 @@ def nearest_codes(
     middle_keys: Sequence[Annotated[Tensor, "T D"]],
     sizes: Sequence[Annotated[Tensor, "T"]],
 ) -> NearestCodes:
-    """The codes of each reference, as seen from the centre and from its middle, and their sizes."""
+    """The codes of each reference, as seen from the centre and from its middle, and their sizes.
+
+    Of a reference's codes the nearest are taken until their sizes sum to 1.
+    """
     width = max(_padded(each.T).shape[1] for each in keys)
-    ends = np.cumsum([0] + [len(each) for each in keys])
-    tables = []
-    for side in (keys, middle_keys):
-        tables.append(array(torch.stack([_padded(each.T, width) for each in side])))
-    padding = torch.full((len(keys), width), _NO_KEY)
-    for row, each in zip(padding, keys, strict=True):
-        row[: len(each)] = 0
-    return NearestCodes(ends, tables[0], tables[1], array(padding), array(torch.cat(list(sizes))), width)
+    directions = []
+    for each in (*keys, *middle_keys):
+        directions.append(_padded(each.T, width))
+    table = torch.zeros(2, len(keys), width)
+    table[0] = _NO_KEY
+    for i, size in enumerate(sizes):
+        table[0, i, : len(size)] = 0
+        table[1, i, : len(size)] = size
+    return NearestCodes(array(torch.stack(directions)), array(table))
 
 
 def nearest(
     x: Annotated[Tensor, "N D"],
-    centre: Annotated[Tensor, "D"],
-    middles: Annotated[Tensor, "references D"],
+    views: Annotated[Tensor, "1+references D"],
     codes: NearestCodes,
     *,
     least: Annotated[Tensor, "1+references"],
-    share: float,
     lower: Annotated[Tensor, "N references"] | None,
 ) -> Annotated[Tensor, "N"]:
-    """The largest of all references' mean cosines of a point with their nearest codes, which are taken until
-    `share` of a reference is full; a cosine is the lesser of those from the centre and from the middle.
+    """The largest of all references' mean cosines of a point with their nearest codes.
 
-    What lies within `least` of the centre, or of a middle, has no direction. `lower` is subtracted.
+    A cosine is the lesser of those from the centre, the first of `views`, and from the middle of the
+    reference, behind it. What lies within `least` of one of them has no direction. `lower` is subtracted.
     """
     from . import mixture_kernels as kernels
 
     out = torch.empty(len(x))
-    bounds = array(least)
-    kernels.nearest(
-        array(x), array(centre), bounds[0], array(middles), bounds[1:], codes.codes, codes.keys, codes.middle_keys,
-        codes.width, codes.padding, codes.sizes, np.float32(share), array(out[:0] if lower is None else lower), out.numpy(),
-    )  # fmt: skip
+    less = array(out[:0] if lower is None else lower)
+    kernels.nearest(array(x), array(views), array(least), *codes, less, out.numpy())
     return out
 
 

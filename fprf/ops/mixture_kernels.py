@@ -34,10 +34,13 @@ from .threads import cached_jit
 _jit = cached_jit(parallel=True, nogil=True)
 _NO_FLOOR = np.float32(-np.inf)
 _ZERO = np.float32(0)
+"""In float32, as all numbers of these loops."""
 _ONE = np.float32(1)
+"""In float32."""
 _LOWEST = -3e38
 """Below all that is compared; no infinity, of which differences are NaN."""
 _LOG2_E = 1 / np.log(2)
+"""exp(x) is 2 to this times x."""
 _LEAST_EXPONENT = -125.0
 """2^-125 stands for all smaller numbers."""
 MANY = 10 * BLOCK
@@ -74,20 +77,24 @@ def _directions(x, first, rows, centre, least, away, factor):
 
 
 @traced
-def softmax(score, at, factor, padding, odds, sharpness, faint, width):
-    """score[at : at + width] times a factor becomes shares; those below `faint` of the largest become 0."""
+def softmax(score, at, factor, odds, softness, width):
+    """score[at : at + width] times a factor becomes shares; those below `faint` of the largest become 0.
+
+    `odds` hold what is added to scores, and behind it to logits; `softness` 1 / temperature and `faint`.
+    """
     lowest = splat(score, _LOWEST, WIDE)
     factor = narrow(factor, WIDE)
-    sharpness = narrow(sharpness, WIDE)
-    faint = narrow(faint, WIDE)
+    sharpness = narrow(softness[0], WIDE)
+    faint = narrow(softness[1], WIDE)
 
     def scale(k, held):
-        scaled = load(score, at + k, WIDE) * factor + load(padding, k, WIDE)
+        scaled = load(score, at + k, WIDE) * factor + load(odds, k, WIDE)
         store(score, at + k, scaled)
         return [maximum(scaled, held[0])]
 
     def weigh(k, held):
-        logit = maximum(lowest, (load(score, at + k, WIDE) - best) * sharpness + load(odds, k, WIDE))
+        logit = (load(score, at + k, WIDE) - best) * sharpness + load(odds, width + k, WIDE)
+        logit = maximum(lowest, logit)
         store(score, at + k, logit)
         return [maximum(logit, held[0])]
 
@@ -114,12 +121,13 @@ def softmax(score, at, factor, padding, odds, sharpness, faint, width):
 
 
 @_jit
-def attention(x, centre, least, keys, width, padding, odds, sharpness, faint, out):
+def attention(x, centre, least, keys, odds, softness, out):
     """out [N count] = shares of the directions of points x [N depth] from a centre, among keys [depth width].
 
-    least < 0: points as they are, less the centre. `padding` [width] lowers the scores of what is no key.
+    least < 0: points as they are, less the centre. `odds` [2 width] and `softness` as of `softmax`.
     """
     depth = len(centre)
+    width = len(odds) // 2
     points = len(x) // depth
     count = len(out) // points
     for task in numba.prange((points + BLOCK - 1) // BLOCK):
@@ -133,18 +141,23 @@ def attention(x, centre, least, keys, width, padding, odds, sharpness, faint, ou
         product(away, 0, keys, 0, width, none, 0, 0, score, depth, _NO_FLOOR)
         for r in range(rows):
             by = factor[r] if least >= _ZERO else _ONE
-            softmax(score, r * width, by, padding, odds, sharpness, faint, width)
+            softmax(score, r * width, by, odds, softness, width)
             for k in range(count):
                 out[(first + r) * count + k] = score[r * width + k]
 
 
 @traced
-def scaled_row(x, at, centre, gain, shift, g_at, out, to, count):
-    """out[to :] = (x[at :] - centre) gain + shift for `count` numbers, whole vectors."""
+def scaled_row(x, at, centre, mixed, m_at, widths, out):
+    """out[at :] = (x[at :] - centre) gain + shift for widths[0] numbers, whole vectors.
+
+    The gains begin at mixed[m_at], the shifts widths[1] behind them.
+    """
+    count, width = widths
 
     def step(k, held):
         away = load(x, at + k, NARROW) - load(centre, k, NARROW)
-        store(out, to + k, away * load(gain, g_at + k, NARROW) + load(shift, g_at + k, NARROW))
+        gain = load(mixed, m_at + k, NARROW)
+        store(out, at + k, away * gain + load(mixed, m_at + width + k, NARROW))
         return held
 
     repeat(count, [splat(x, 0.0, NARROW)], step, by=NARROW)
@@ -158,8 +171,11 @@ def _shares(share, first, rows, count, held):
 
 
 @_jit
-def scaled(x, centre, share, gain, bias, width, out):
-    """out [N channels] = (x - centre) (share gain) + share bias, channel by channel; gain, bias [K width]."""
+def scaled(x, centre, share, table, width, out):
+    """out [N channels] = (x - centre) (share gain) + share bias, channel by channel.
+
+    table [K 2 width]: the gain and the bias of each region, side by side.
+    """
     channels = len(centre)
     points = len(x) // channels
     count = len(share) // points
@@ -168,18 +184,16 @@ def scaled(x, centre, share, gain, bias, width, out):
         first = task * BLOCK
         rows = min(BLOCK, points - first)
         belongs = np.empty(BLOCK * count, np.float32)
-        gains = np.empty(BLOCK * width, np.float32)
-        shifts = np.empty(BLOCK * width, np.float32)
-        none = np.zeros(width, np.float32)
+        mixed = np.empty(2 * BLOCK * width, np.float32)
+        none = np.zeros(2 * width, np.float32)
         _shares(share, first, rows, count, belongs)
-        product(belongs, 0, gain, 0, width, none, 0, 0, gains, count, _NO_FLOOR)
-        product(belongs, 0, bias, 0, width, none, 0, 0, shifts, count, _NO_FLOOR)
+        product(belongs, 0, table, 0, 2 * width, none, 0, 0, mixed, count, _NO_FLOOR)
         for r in range(rows):
             at = (first + r) * channels
-            scaled_row(x, at, centre, gains, shifts, r * width, out, at, whole)
+            m = 2 * r * width
+            scaled_row(x, at, centre, mixed, m, (whole, width), out)
             for c in range(whole, channels):
-                mixed = gains[r * width + c]
-                out[at + c] = (x[at + c] - centre[c]) * mixed + shifts[r * width + c]
+                out[at + c] = (x[at + c] - centre[c]) * mixed[m + c] + mixed[m + width + c]
 
 
 @traced
@@ -195,25 +209,24 @@ def take_row(x, at, centre, share, out, to, count):
 
 
 @traced
-def add_row(x, at, share, bias, b_at, out, to, count):
-    """out[to :] += x[at :] + share bias[b_at :] for `count` numbers, whole vectors."""
+def add_row(x, at, out, to, count):
+    """out[to :] += x[at :] for `count` numbers, whole vectors."""
 
     def step(k, held):
-        more = load(x, at + k, NARROW) + narrow(share, NARROW) * load(bias, b_at + k, NARROW)
-        store(out, to + k, load(out, to + k, NARROW) + more)
+        store(out, to + k, load(out, to + k, NARROW) + load(x, at + k, NARROW))
         return held
 
     repeat(count, [splat(x, 0.0, NARROW)], step, by=NARROW)
 
 
 @_jit
-def affine(x, centre, share, matrix, bias, width, out):
-    """out [N width] = sum_k share[n, k] ((x[n] - centre) matrix[k] + bias[k]); what has no share costs
-    nothing.
+def affine(x, centre, share, maps, width, out):
+    """out [N width] = sum_k share[n, k] ((x[n] - centre) A_k + b_k); what has no share costs nothing.
 
-    matrix [K channels width], bias [K width].
+    maps [K channels+1 width]: A and below it b of each region.
     """
     channels = len(centre)
+    depth = channels + 1
     points = len(x) // channels
     count = len(share) // points
     whole = channels - channels % NARROW
@@ -221,8 +234,7 @@ def affine(x, centre, share, matrix, bias, width, out):
         first = task * MANY
         last = min(points, first + MANY)
         members = np.empty(BLOCK, np.int64)
-        weight = np.empty(BLOCK, np.float32)
-        taken = np.empty(BLOCK * channels, np.float32)
+        taken = np.empty(BLOCK * depth, np.float32)
         moved = np.empty(BLOCK * width, np.float32)
         none = np.zeros(width, np.float32)
         out[first * width : last * width] = _ZERO
@@ -232,19 +244,17 @@ def affine(x, centre, share, matrix, bias, width, out):
                 by = share[n * count + k]
                 if by != _ZERO:
                     members[rows] = n
-                    weight[rows] = by
-                    take_row(x, n * channels, centre, by, taken, rows * channels, whole)
+                    take_row(x, n * channels, centre, by, taken, rows * depth, whole)
                     for c in range(whole, channels):
-                        taken[rows * channels + c] = by * (x[n * channels + c] - centre[c])
+                        taken[rows * depth + c] = by * (x[n * channels + c] - centre[c])
+                    taken[rows * depth + channels] = by
                     rows += 1
                 if rows < BLOCK and (n < last - 1 or rows == 0):
                     continue
-                taken[rows * channels : BLOCK * channels] = _ZERO
-                table = k * channels * width
-                product(taken, 0, matrix, table, width, none, 0, 0, moved, channels, _NO_FLOOR)
+                taken[rows * depth : BLOCK * depth] = _ZERO
+                product(taken, 0, maps, k * depth * width, width, none, 0, 0, moved, depth, _NO_FLOOR)
                 for r in range(rows):
-                    to = members[r] * width
-                    add_row(moved, r * width, weight[r], bias, k * width, out, to, width)
+                    add_row(moved, r * width, out, members[r] * width, width)
                 rows = 0
 
 
@@ -270,36 +280,34 @@ def coloured(colour, share, maps, width, out):
 
 
 @numba.njit(inline="always")
-def _nearest_mean(near, at, count, size, first, share):
-    """Mean of the nearest codes, from the nearest on until `share` of the sizes is full; `near` is used
-    up.
-    """
-    left = share
+def _nearest_mean(near, at, table, first, width):
+    """Mean of the nearest codes, from the nearest on until their sizes sum to 1; `near` is used up."""
+    left = _ONE
     mean = _ZERO
-    for _ in range(count):
+    for _ in range(width):
         best = 0
-        for t in range(1, count):
+        for t in range(1, width):
             if near[at + t] > near[at + best]:
                 best = t
-        taken = min(size[first + best], left)
+        taken = min(table[first + best], left)
         mean += taken * near[at + best]
         left -= taken
         if left <= _ZERO:
             break
         near[at + best] = np.float32(_LOWEST)
-    return mean / (share - left)
+    return mean / (_ONE - left)
 
 
 @traced
-def lesser(score, at, seen, factor, other, padding, p_at, width):
-    """score[at :] = the lesser of score times a factor and seen times another, plus the padding; NaN where one
-    is, else 0.
+def lesser(score, at, seen, factors, table, t_at, width):
+    """score[at :] = the lesser of score and seen, each times its factor, plus the table; NaN where one is,
+    else 0.
     """
 
     def step(k, unknown):
-        one = load(score, at + k, WIDE) * narrow(factor, WIDE)
-        two = load(seen, at + k, WIDE) * narrow(other, WIDE)
-        store(score, at + k, minimum(one, two) + load(padding, p_at + k, WIDE))
+        one = load(score, at + k, WIDE) * narrow(factors[0], WIDE)
+        two = load(seen, at + k, WIDE) * narrow(factors[1], WIDE)
+        store(score, at + k, minimum(one, two) + load(table, t_at + k, WIDE))
         return [unknown[0] + two * 0.0 + one * 0.0]
 
     (unknown,) = repeat(width, [splat(score, 0.0, WIDE)], step, by=WIDE)
@@ -307,31 +315,18 @@ def lesser(score, at, seen, factor, other, padding, p_at, width):
 
 
 @_jit
-def nearest(
-    x,
-    centre,
-    least,
-    middles,
-    least_middles,
-    codes,
-    keys,
-    middle_keys,
-    width,
-    padding,
-    sizes,
-    share,
-    lower,
-    out,
-):
+def nearest(x, views, least, keys, table, lower, out):
     """out [N] = over all references the largest mean cosine of a point with its nearest codes.
 
-    A cosine is the lesser of two: from the centre and from the middle of each reference. Reference i has
-    codes[i] : codes[i + 1] of the sizes, and keys [references, depth, width] for either. `padding`
-    [references, width] lowers what is no code, `lower` [N references] all of them; empty = nothing.
+    A cosine is the lesser of two: from the centre, views[0], and from the middle of each reference, behind it;
+    within `least` of either a point has no direction. keys [2 references depth width] are directions of codes
+    from the one and from the other. table [2 references width] lowers what is no code, and holds sizes of
+    codes: the nearest are taken until these sum to 1. `lower` [N references] is subtracted; empty = nothing.
     """
-    depth = len(centre)
+    references = len(least) - 1
+    depth = len(views) // (references + 1)
+    width = len(table) // (2 * references)
     points = len(x) // depth
-    references = len(codes) - 1
     for task in numba.prange((points + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         rows = min(BLOCK, points - first)
@@ -343,19 +338,19 @@ def nearest(
         seen = np.empty(BLOCK * width, np.float32)
         none = np.zeros(width, np.float32)
         found = np.full(BLOCK, -_ONE)
-        _directions(x, first, rows, centre, least, away, factor)
+        _directions(x, first, rows, views[:depth], least[0], away, factor)
         for i in range(references):
-            middle = middles[i * depth : (i + 1) * depth]
-            _directions(x, first, rows, middle, least_middles[i], aside, other)
-            table = i * depth * width
-            product(away, 0, keys, table, width, none, 0, 0, score, depth, _NO_FLOOR)
-            product(aside, 0, middle_keys, table, width, none, 0, 0, seen, depth, _NO_FLOOR)
-            count = codes[i + 1] - codes[i]
+            middle = views[(i + 1) * depth : (i + 2) * depth]
+            _directions(x, first, rows, middle, least[i + 1], aside, other)
+            here = i * depth * width
+            there = (references + i) * depth * width
+            product(away, 0, keys, here, width, none, 0, 0, score, depth, _NO_FLOOR)
+            product(aside, 0, keys, there, width, none, 0, 0, seen, depth, _NO_FLOOR)
             for r in range(rows):
                 at = r * width
                 less = lower[(first + r) * references + i] if len(lower) > 0 else _ZERO
                 # A comparison passes over NaN; sums do not.
-                unknown = lesser(score, at, seen, factor[r], other[r], padding, i * width, width)
-                mean = _nearest_mean(score, at, count, sizes, codes[i], share)
+                unknown = lesser(score, at, seen, (factor[r], other[r]), table, i * width, width)
+                mean = _nearest_mean(score, at, table, (references + i) * width, width)
                 found[r] = max(found[r], mean - less) + unknown
         out[first : first + rows] = found[:rows]

@@ -55,11 +55,10 @@ def propose(
     """
     from . import proposal_kernels as kernels
 
+    rays = torch.cat([origin, direction, near[:, None], far[:, None], shift], 1)
+    numbers = _numbers(warp, limit, padding)
     out = torch.empty(len(s), count + 1)
-    kernels.propose(
-        *(array(x) for x in (origin, direction, near, far, s)), _numbers(warp), array(table), size, table.shape[1],
-        array(weight), np.float32(limit), np.float32(padding), array(shift), out.view(-1).numpy(),
-    )  # fmt: skip
+    kernels.propose(array(rays), array(s), numbers, array(table), size, array(weight), out.view(-1).numpy())
     return out
 
 
@@ -72,11 +71,12 @@ def place(
     """Middles of the steps between edges, in the unit cube."""
     from . import proposal_kernels as kernels
 
+    rays = torch.nn.functional.pad(torch.cat([origin, direction], 1), (0, kernels.COLUMNS - 6))
     out = torch.empty(len(t) * (t.shape[1] - 1), 3)
-    kernels.place(array(origin), array(direction), array(t), _numbers(warp), out.view(-1).numpy())
+    kernels.place(array(rays), array(t), _numbers(warp), out.view(-1).numpy())
     return out
 
 
-def _numbers(warp: Warp) -> Floats:
-    offset = [warp.offset] * 3
-    return np.array([warp.curved, warp.contracted, *warp.low, *warp.factor, *offset], dtype=np.float32)
+def _numbers(warp: Warp, *more: float) -> Floats:
+    held = [warp.curved, warp.contracted, *warp.low, *warp.factor, warp.offset, *more]
+    return np.array(held, dtype=np.float32)

@@ -1,8 +1,8 @@
 """The compiled loops behind `proposal`: what happens along one ray stays in the cache.
 
 Arrays are flat, contiguous float32, rays side by side. `warp` holds 1 where distances are those of a
-contraction, 1 where points are contracted, and what else is subtracted from points and multiplied on each
-axis (`rendering.space`).
+contraction, 1 where points are contracted, and for others what is subtracted from points and multiplied on
+each axis, and then subtracted (`rendering.space`).
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, call-arg"
@@ -35,9 +35,13 @@ STRETCH = 16
 _BLACK = 20.0
 """Optical depth behind which nothing is looked up: exp(-20) = 2e-9 of the light is left."""
 _ZERO = np.float32(0)
+"""In float32, as all numbers of these loops."""
 _ONE = np.float32(1)
-_TWO = np.float32(2)
+"""In float32."""
 _HALF = np.float32(0.5)
+"""In float32."""
+COLUMNS = 9
+"""Numbers of a ray: origin, direction, near, far, shift of new edges."""
 
 
 @numba.njit(inline="always")
@@ -54,37 +58,39 @@ def _distances(s, first, edges, near, far, warp, t):
     for k in range(edges):
         g = g_near + (g_far - g_near) * s[first + k]
         c = c_far + (c_near - c_far) * (_ONE - s[first + k])
-        t[k] = _TWO * g if g < _HALF else _HALF / min(c, _HALF)
+        t[k] = g + g if g < _HALF else _HALF / min(c, _HALF)
 
 
 @numba.njit(inline="always")
-def _located(origin, direction, ray, t, first, count, warp, out, to):
-    """Middles of `count` steps in the unit cube (`Space.locate`), to out[to :]."""
+def _located(rays, at, t, first, count, warp, out):
+    """Middles of `count` steps of the ray at rays[at] in the unit cube (`Space.locate`)."""
     for k in range(count):
         middle = _HALF * (t[first + k] + t[first + k + 1])
-        at = to + 3 * k
-        x = origin[3 * ray] + direction[3 * ray] * middle
-        y = origin[3 * ray + 1] + direction[3 * ray + 1] * middle
-        z = origin[3 * ray + 2] + direction[3 * ray + 2] * middle
+        x = rays[at] + rays[at + 3] * middle
+        y = rays[at + 1] + rays[at + 4] * middle
+        z = rays[at + 2] + rays[at + 5] * middle
         if warp[1] == _ONE:
             m = max(max(abs(x), abs(y)), max(abs(z), _ONE))
             factor = _ONE - _HALF / m
-            out[at] = factor * (x / m)
-            out[at + 1] = factor * (y / m)
-            out[at + 2] = factor * (z / m)
+            out[3 * k] = factor * (x / m)
+            out[3 * k + 1] = factor * (y / m)
+            out[3 * k + 2] = factor * (z / m)
         else:
-            out[at] = (x - warp[2]) * warp[5] - warp[8]
-            out[at + 1] = (y - warp[3]) * warp[6] - warp[9]
-            out[at + 2] = (z - warp[4]) * warp[7] - warp[10]
+            out[3 * k] = (x - warp[2]) * warp[5] - warp[8]
+            out[3 * k + 1] = (y - warp[3]) * warp[6] - warp[8]
+            out[3 * k + 2] = (z - warp[4]) * warp[7] - warp[8]
 
 
 @traced
-def projected(table, weight, a, b, c, step, stride, u, v, w, channels):
-    """The product of the samples of three planes at one point, times a weight for each channel, summed."""
-    shares = [narrow(share, NARROW) for share in (u, v, w)]
+def projected(table, weight, corners, steps, shares, channels):
+    """The product of the samples of three planes at one point, times a weight for each channel, summed.
+
+    `corners` are the first numbers of the lower corners, `steps` lead to the next node across and down.
+    """
+    apart = [narrow(share, NARROW) for share in shares]
 
     def add(k, sums):
-        x, y, z = samples_of(table, (a + k, b + k, c + k), step, stride, shares)
+        x, y, z = samples_of(table, [corner + k for corner in corners], *steps, apart)
         return [sums[0] + x * y * z * load(weight, k, NARROW)]
 
     (found,) = repeat(channels, [splat(table, 0.0, NARROW)], add, by=NARROW)
@@ -92,105 +98,101 @@ def projected(table, weight, a, b, c, step, stride, u, v, w, channels):
 
 
 @traced
-def transmitted(depth, at, count):
-    """depth[at :] = exp(-depth[at :]) for `count` numbers, whole vectors; 0 beyond exp(-87)."""
+def transmitted(depth, count):
+    """depth = exp(-depth) for `count` numbers, whole vectors; 0 beyond exp(-87)."""
 
     def step(k, held):
-        raw = maximum(splat(depth, LEAST_EXPONENT, WIDE), -load(depth, at + k, WIDE))
-        store(depth, at + k, exp2(raw * LOG2_E) + raw * 0.0)
+        raw = maximum(splat(depth, LEAST_EXPONENT, WIDE), -load(depth, k, WIDE))
+        store(depth, k, exp2(raw * LOG2_E) + raw * 0.0)
         return held
 
     repeat(count, [splat(depth, 0.0, WIDE)], step, by=WIDE)
 
 
 @numba.njit(inline="always")
-def _resampled(s, first, w, steps, padding, count, shift, out, to):
+def _resampled(s, w, padding, shift, out):
     """`stepfun.resample` of one ray: walks the steps and the wanted shares side by side."""
+    steps = len(s) - 1
     extra = padding / np.float32(steps)
     whole = 0.0
     for k in range(steps):
         whole += w[k] + extra
     if not (whole > 0.0):  # NaN stays to be seen
-        out[to : to + count + 1] = np.float32(np.nan)
+        out[:] = np.float32(np.nan)
         return
-    step = 1.0 / (count + 1)
+    step = 1.0 / len(out)
     here = 0
     low = 0.0
     high = float(w[0] + extra)
-    for k in range(count + 1):
+    for k in range(len(out)):
         wanted = (k + shift) * step * whole
         while high <= wanted and here < steps - 1:
             here += 1
             low = high
             high += w[here] + extra
         share = (wanted - low) / (high - low)
-        left = s[first + here]
-        right = s[first + here + 1]
-        out[to + k] = left + np.float32(min(max(share, 0.0), 1.0)) * (right - left)
+        left = s[here]
+        out[k] = left + np.float32(min(max(share, 0.0), 1.0)) * (s[here + 1] - left)
 
 
 @_jit
-def propose(origin, direction, near, far, s, warp, table, size, channels, weight, limit, padding, shift, out):
+def propose(rays, s, warp, table, size, weight, out):
     """New edges out [R count+1] at even steps of the rendering weights of planes along edges s [R E].
 
-    Density is exp(min(feature . weight - 1, limit)). shift [R] moves each ray's steps by a share of one.
+    Density is exp(min(feature . weight - 1, limit)); `limit` and the padding stand behind the other numbers of
+    `warp`. The shift of a ray moves its steps by a share of one.
     """
-    rays = len(near)
-    edges = len(s) // rays
-    count = len(out) // rays - 1
+    channels = len(weight)
+    count = len(rays) // COLUMNS
+    edges = len(s) // count
+    wanted = len(out) // count
+    limit = warp[9]
     steps = edges - 1
-    room = (edges + WIDE - 1) // WIDE * WIDE + STRETCH
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
+    room = (edges + WIDE - 1) // WIDE * WIDE
+    for task in numba.prange((count + RAYS - 1) // RAYS):
         t = np.empty(edges, np.float32)
         points = np.empty(3 * STRETCH, np.float32)
         corner = np.empty(3 * BLOCK, np.int64)
         part = np.empty(3 * BLOCK, np.float32)
-        density = np.empty(room, np.float32)
-        light = np.empty(room, np.float32)
-        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
-            _distances(s, ray * edges, edges, near[ray], far[ray], warp, t)
+        density = np.empty(room + STRETCH, np.float32)
+        depths = np.empty(room, np.float32)
+        for ray in range(task * RAYS, min(count, task * RAYS + RAYS)):
+            at = ray * COLUMNS
+            _distances(s, ray * edges, edges, rays[at + 6], rays[at + 7], warp, t)
             depth = 0.0
-            light[0] = _ZERO
+            depths[:] = _ZERO
             density[:] = _ZERO
             for first in range(0, steps, STRETCH):
                 some = min(STRETCH, steps - first)
-                if depth <= _BLACK or depth != depth:
-                    _located(origin, direction, ray, t, first, some, warp, points, 0)
+                if depth <= _BLACK:
+                    _located(rays, at, t, first, some, warp, points)
                     cells(points, 0, some, size, 0, channels, corner, part)
                     for k in range(some):
-                        density[first + k] = projected(
-                            table,
-                            weight,
-                            corner[k],
-                            corner[BLOCK + k],
-                            corner[2 * BLOCK + k],
-                            channels,
-                            size * channels,
-                            part[k],
-                            part[BLOCK + k],
-                            part[2 * BLOCK + k],
-                            channels,
-                        )
+                        corners = (corner[k], corner[BLOCK + k], corner[2 * BLOCK + k])
+                        shares = (part[k], part[BLOCK + k], part[2 * BLOCK + k])
+                        apart = (channels, size * channels)
+                        density[first + k] = projected(table, weight, corners, apart, shares, channels)
                     exponential(density, first, limit, STRETCH)
                     for k in range(first, first + some):
                         depth += density[k] * (t[k + 1] - t[k])
-                        light[k + 1] = np.float32(depth)
+                        depths[k + 1] = np.float32(depth)
                 else:
-                    for k in range(first, first + some):
-                        light[k + 1] = np.float32(depth)
-            light[edges:] = _ZERO
-            transmitted(light, 0, room - STRETCH)
+                    depths[first + 1 : first + some + 1] = np.float32(depth)
+            transmitted(depths, room)
             for k in range(steps):
-                density[k] = light[k] - light[k + 1]
-            _resampled(s, ray * edges, density, steps, padding, count, shift[ray], out, ray * (count + 1))
+                density[k] = depths[k] - depths[k + 1]
+            here = s[ray * edges : (ray + 1) * edges]
+            goal = out[ray * wanted : (ray + 1) * wanted]
+            _resampled(here, density, warp[10], rays[at + 8], goal)
 
 
 @_jit
-def place(origin, direction, t, warp, out):
+def place(rays, t, warp, out):
     """Middles [R S 3] of the steps between edges t [R E], in the unit cube."""
-    rays = len(origin) // 3
-    edges = len(t) // rays
-    for task in numba.prange((rays + RAYS - 1) // RAYS):
-        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
-            to = 3 * ray * (edges - 1)
-            _located(origin, direction, ray, t, ray * edges, edges - 1, warp, out, to)
+    count = len(rays) // COLUMNS
+    edges = len(t) // count
+    width = 3 * (edges - 1)
+    for task in numba.prange((count + RAYS - 1) // RAYS):
+        for ray in range(task * RAYS, min(count, task * RAYS + RAYS)):
+            goal = out[ray * width : (ray + 1) * width]
+            _located(rays, ray * COLUMNS, t, ray * edges, edges - 1, warp, goal)

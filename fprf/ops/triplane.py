@@ -153,10 +153,11 @@ def weighed(
 
     values = torch.empty(len(points), len(resolutions) * table.shape[1])
     density = torch.empty(len(points))
+    numbers, _, sizes, starts = _laid_out(table, resolutions)
+    limited = torch.nn.functional.pad(weight.detach(), (0, 1), value=limit)
     kernels.weighed(
-        array(points), *_laid_out(table, resolutions), array(weight), np.float32(limit), values.view(-1).numpy(),
-        density.numpy(),
-    )  # fmt: skip
+        array(points), numbers, sizes, starts, array(limited), values.view(-1).numpy(), density.numpy()
+    )
     return density, values
 
 

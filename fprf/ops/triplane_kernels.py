@@ -28,6 +28,7 @@ from .threads import cached_jit
 AXES = ((0, 1), (0, 2), (1, 2))
 """Those of `triplane`, which imports this module."""
 LOG2_E = 1 / np.log(2)
+"""exp(x) is 2 to this times x."""
 LEAST_EXPONENT = -87.0
 """exp(-87) stands for all smaller numbers."""
 GROUP = 16
@@ -215,10 +216,12 @@ def dot(x, at, weight, count):
 
 
 @_jit
-def weighed(points, table, channels, sizes, starts, weight, limit, out, density):
-    """`forward`, and density[n] = exp(min(out[n] . weight - 1, limit))."""
+def weighed(points, table, sizes, starts, weight, out, density):
+    """`forward`, and density[n] = exp(min(out[n] . weight - 1, limit)); the limit stands behind the weights."""
     count = len(points) // 3
-    width = len(sizes) * channels
+    width = len(weight) - 1
+    channels = width // len(sizes)
+    limit = weight[width]
     for task in numba.prange((count + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         corner = np.empty(3 * BLOCK, np.int64)
@@ -400,8 +403,11 @@ def variation(table, channels, sizes, starts):
 
 
 @traced
-def apart_from_neighbours(table, at, west, east, north, south, factor, out, count):
-    """out[at :] = factor (4 table[at :] - those at four offsets) for `count` numbers, whole vectors."""
+def apart_from_neighbours(table, at, offsets, factor, out, count):
+    """out[at :] = factor (4 table[at :] - those at four offsets, west, east, north, south) for `count` numbers,
+    whole vectors.
+    """
+    west, east, north, south = offsets
 
     def step(k, held):
         x = at + k
@@ -429,6 +435,10 @@ def variation_gradient(table, channels, sizes, starts, scale, out):
             north = width if v > 0 else 0
             south = width if v < size - 1 else 0
             inner = first + channels
-            apart_from_neighbours(table, first, 0, channels, north, south, factor, out, channels)
-            apart_from_neighbours(table, inner, channels, channels, north, south, factor, out, last - inner)
-            apart_from_neighbours(table, last, channels, 0, north, south, factor, out, channels)
+            none = 0 * channels
+            begin = (none, channels, north, south)
+            apart_from_neighbours(table, first, begin, factor, out, channels)
+            within = (channels, channels, north, south)
+            apart_from_neighbours(table, inner, within, factor, out, last - inner)
+            end = (channels, none, north, south)
+            apart_from_neighbours(table, last, end, factor, out, channels)

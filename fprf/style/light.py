@@ -201,12 +201,10 @@ class Light(nn.Module):
             codes = self._codes(i)
             keys.append(shown_units(self.keys[codes], self.beyond[codes], centre))
             aside.append(shown_units(self.keys[codes], self.beyond[codes], middle))
-            sizes.append(self.share[codes] / self.share[codes].sum())
-        least = no_direction(torch.cat([centre[None], self.middles]))
+            sizes.append(self.share[codes] / (self.share[codes].sum() * _NEAREST_SHARE))
+        views = torch.cat([centre[None], self.middles])
         tables = mixture.nearest_codes(keys, aside, sizes)
-        return mixture.nearest(
-            points, centre, self.middles, tables, least=least, share=_NEAREST_SHARE, lower=lower
-        )
+        return mixture.nearest(points, views, tables, least=no_direction(views), lower=lower)
 
     def _codes(self, reference: int) -> Annotated[Tensor, "codes"]:
         return (self.reference == reference).nonzero().squeeze(1)

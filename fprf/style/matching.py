@@ -52,7 +52,8 @@ def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotat
 
 def no_direction(centre: Annotated[Tensor, "... D"]) -> Annotated[Tensor, "..."]:
     """Distance from a centre up to which nothing has a direction: what is left of it is rounding."""
-    return _ROUNDING_SHARE * torch.linalg.vector_norm(centre, dim=-1)
+    length: Tensor = torch.linalg.vector_norm(centre, dim=-1)
+    return _ROUNDING_SHARE * length
 
 
 def share_mean(keys: Annotated[Tensor, "T D"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "D"]:

@@ -142,13 +142,13 @@ def test_nearest_codes_err_as_their_cosines(depth: int, codes: list[int], seed: 
     beyond = [draw(count, seed=seed + 9 + i).square() for i, count in enumerate(codes)]
     sizes = [torch.softmax(draw(count, seed=seed + 20 + i), 0) for i, count in enumerate(codes)]
     lower = torch.rand(points, len(codes), generator=torch.Generator().manual_seed(seed))
+    views = torch.cat([centre[None], middles])
     table = mixture.nearest_codes(
         [shown_units(key, more, centre) for key, more in zip(keys, beyond, strict=True)],
         [shown_units(key, more, m) for key, more, m in zip(keys, beyond, middles, strict=True)],
-        sizes,
+        [size / 0.05 for size in sizes],
     )
-    least = no_direction(torch.cat([centre[None], middles]))
-    found = mixture.nearest(x, centre, middles, table, least=least, share=0.05, lower=lower)
+    found = mixture.nearest(x, views, table, least=no_direction(views), lower=lower)
     best = torch.full((points,), -1.0, dtype=torch.float64)
     for i, (key, more, size) in enumerate(zip(keys, beyond, sizes, strict=True)):
         near = cosines(x.double(), key.double(), more.double(), centre.double(), middles[i].double())
@@ -165,9 +165,8 @@ def test_nearest_codes_of_nan_are_nan() -> None:
     x[2, 1] = float("nan")
     zero = torch.zeros(8)
     key = draw(3, 8, seed=1)
-    size = torch.full((3,), 1 / 3)
-    table = mixture.nearest_codes([unit(key, zero)], [unit(key, zero)], [size])
-    found = mixture.nearest(x, zero, zero[None], table, least=torch.zeros(2), share=0.05, lower=None)
+    table = mixture.nearest_codes([unit(key, zero)], [unit(key, zero)], [torch.ones(3)])
+    found = mixture.nearest(x, torch.zeros(2, 8), table, least=torch.zeros(2), lower=None)
     assert found.isnan().tolist() == [False, False, True, False, False]
 
 

@@ -64,7 +64,9 @@ def test_a_restyle_is_the_restyled_render(
     for style in (None, look, None):
         found = cached.restyled(style)
         wanted = trained.restyled(style).render(trained.cameras, 2)
-        torch.testing.assert_close(found, wanted, atol=0, rtol=0)
+        # Where no style acts the render joins two linear maps, which rounds elsewhere.
+        joined = style is None or style.idle
+        torch.testing.assert_close(found, wanted, atol=1e-6 if joined else 0, rtol=0)
         assert strength > 0 or torch.equal(found.rgb, cached.restyled().rgb), "strength 0 is the plain render"
 
 
@@ -74,7 +76,8 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     facts = replace(trained.known.facts, background=(1.0, 0.0, 0.5))
     trained = replace(trained, known=replace(trained.known, facts=facts))
     cached = trained.cached(trained.cameras, 1)
-    assert torch.equal(cached.restyled().rgb, trained.render(trained.cameras, 1).rgb)
+    plain = trained.render(trained.cameras, 1).rgb
+    torch.testing.assert_close(cached.restyled().rgb, plain, atol=1e-6, rtol=0)
     assert sum(part.rays for part in cached.chunks) == 32 * 24
     per_sample = 4 * (1 + 48 + trained.known.facts.of_field.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.chunks)
