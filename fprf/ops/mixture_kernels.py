@@ -280,16 +280,18 @@ def coloured(colour, share, maps, width, out):
 
 
 @numba.njit(inline="always")
-def _nearest_mean(near, at, table, first, width):
-    """Mean of the nearest codes, from the nearest on until their sizes sum to 1; `near` is used up."""
+def _nearest_mean(near, at, sizes, count):
+    """Mean of the nearest of `count` codes, from the nearest on until their sizes sum to 1; `near` is used
+    up.
+    """
     left = _ONE
     mean = _ZERO
-    for _ in range(width):
+    for _ in range(count):
         best = 0
-        for t in range(1, width):
+        for t in range(1, count):
             if near[at + t] > near[at + best]:
                 best = t
-        taken = min(table[first + best], left)
+        taken = min(sizes[best], left)
         mean += taken * near[at + best]
         left -= taken
         if left <= _ZERO:
@@ -346,11 +348,15 @@ def nearest(x, views, least, keys, table, lower, out):
             there = (references + i) * depth * width
             product(away, 0, keys, here, width, none, 0, 0, score, depth, _NO_FLOOR)
             product(aside, 0, keys, there, width, none, 0, 0, seen, depth, _NO_FLOOR)
+            sizes = table[(references + i) * width : (references + i + 1) * width]
+            count = width
+            while count > 1 and sizes[count - 1] == _ZERO:
+                count -= 1
             for r in range(rows):
                 at = r * width
                 less = lower[(first + r) * references + i] if len(lower) > 0 else _ZERO
                 # A comparison passes over NaN; sums do not.
                 unknown = lesser(score, at, seen, (factor[r], other[r]), table, i * width, width)
-                mean = _nearest_mean(score, at, table, (references + i) * width, width)
+                mean = _nearest_mean(score, at, sizes, count)
                 found[r] = max(found[r], mean - less) + unknown
         out[first : first + rows] = found[:rows]

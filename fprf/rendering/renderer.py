@@ -161,12 +161,13 @@ def shade(
     content: Annotated[Tensor, "M C"],
     semantic: Annotated[Tensor, "M D"] | None,
     restyle: "Restyle | None",
+    plain: Annotated[Tensor, "M 3"] | None = None,
 ) -> Annotated[Tensor, "M 3"]:
-    """Colours of samples in a style (None = plain)."""
+    """Colours of samples in a style (None = plain); `plain` are those without one, where they are known."""
     if restyle is None or restyle.idle:
-        plain: Tensor = decoder(content)
-        return plain
-    return restyle.colour(decoder, content, semantic if Want.SEMANTIC in restyle.needs else None)
+        own: Tensor = decoder(content) if plain is None else plain
+        return own
+    return restyle.colour(decoder, content, semantic if Want.SEMANTIC in restyle.needs else None, plain)
 
 
 def composite(

@@ -440,9 +440,13 @@ class Restyle:
         return replace(first, others=tuple(rest))
 
     def colour(
-        self, decoder: Decoder, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+        self,
+        decoder: Decoder,
+        content: Annotated[Tensor, "N C"],
+        semantic: Annotated[Tensor, "N D"] | None,
+        plain: Annotated[Tensor, "N 3"] | None = None,
     ) -> Annotated[Tensor, "N 3"]:
-        """Colours of points in this look, in [0, 1]."""
+        """Colours of points in this look, in [0, 1]; `plain` are those of their content, where they are known."""
         parts = []
         for part in self.parts:
             if part.share > 0:
@@ -458,7 +462,7 @@ class Restyle:
                 active.append((part, each))
         own = colour
         if luminance > 0 or any(each.paint is not None for _, each in active):
-            own = decoder(content)
+            own = decoder(content) if plain is None else plain
         # Colours: the maps move what was decoded, light moves the scene's own colours.
         changes = []
         for part, each in active:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -69,21 +69,18 @@ class ViewChunk:
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factor of the final colours."""
     plain: Annotated[Tensor, "M 3"] | None = None
-    """Colours as they are, in the place of content where no style is asked for."""
+    """Colours of the samples as they are, where they are known; without content where no style is asked for."""
 
     @property
     def bytes(self) -> int:
         """Memory that it holds."""
-        held = (*self.kept, self.content, self.semantic, self.depth, self.opacity)
+        held = (*self.kept, self.content, self.semantic, self.depth, self.opacity, self.plain)
         return sum(t.numel() * t.element_size() for t in held if isinstance(t, Tensor))
 
     @torch.inference_mode()
     def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
         """Colours of its pixels in a style, or as they are, in [0, 1]."""
-        if self.plain is None:
-            values = shade(decoder, self.content, self.semantic, restyle)
-        else:
-            values = self.plain
+        values = shade(decoder, self.content, self.semantic, restyle, self.plain)
         rgb = composite(self.kept, values, self.rays) + self.behind
         return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1)
 
@@ -232,9 +229,13 @@ class CachedView(SceneView):
 
 
 def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
-    """Render everything but a style (see `view_chunks`)."""
+    """Render everything but a style (see `view_chunks`), and the colours as they are, which styles mix in."""
     width, height = cameras.size[view].tolist()
-    return CachedView(model.decoder, tuple(view_chunks(model, facts, cameras, view, config)), (height, width))
+    chunks = []
+    for chunk in view_chunks(model, facts, cameras, view, config):
+        with torch.inference_mode():
+            chunks.append(replace(chunk, plain=model.decoder(chunk.content)))
+    return CachedView(model.decoder, tuple(chunks), (height, width))
 
 
 @torch.inference_mode()
