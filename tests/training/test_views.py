@@ -79,7 +79,7 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     plain = trained.render(trained.cameras, 1).rgb
     torch.testing.assert_close(cached.restyled().rgb, plain, atol=1e-6, rtol=0)
     assert sum(part.rays for part in cached.chunks) == 32 * 24
-    per_sample = 4 * (1 + 48 + trained.known.facts.of_field.dim) + 8
+    per_sample = 4 * (1 + 3 + 48 + trained.known.facts.of_field.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.chunks)
     assert (
         kept * per_sample <= sum(part.bytes for part in cached.chunks) <= kept * per_sample + 16 * 32 * 24 + 8
