@@ -236,7 +236,8 @@ def _map(
         lenses = trial.grouping.lenses
         for name, value in trial.focal.items():
             focal[lenses[name]] = value
-    job = {"step": "mapping", "models": str(out), "lenses": lenses, "focal": focal}
+    known = not unsaid_lenses(state.images)
+    job = {"step": "mapping", "models": str(out), "lenses": lenses, "focal": focal, "focal_known": known}
     _run(place, state, config, job, registered, len(state.images), progress)
     return list(json.loads((out / "models.json").read_text(encoding="utf-8")))
 
