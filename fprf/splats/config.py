@@ -164,7 +164,9 @@ class GaussiansConfig(RunConfig):
     encoded: at 240 the bundled encoder tells things apart best (docs/gaussians.md).
     """
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind everything, also where images have transparency."""
+    """Colour behind everything, also where images have transparency. Where none has, each step of training has
+    another one behind, so that dark surfaces become opaque.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()

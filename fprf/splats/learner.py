@@ -167,6 +167,9 @@ class RunSource:
 class GaussianLearner(SceneLearner):
     """Gaussians in training; `source` is given to learners of a run.
 
+    `opaque` says that no photograph shows a background. Each step is then drawn over a colour of its own: over
+    the same dark one in all steps, dark surfaces are learnt as holes (backgrounds.json).
+
     On a CUDA `device` they are drawn and moved there, where gsplat can; what is decided every tenth step or
     more rarely (widths, splits) is decided on the CPU.
     """
@@ -180,9 +183,11 @@ class GaussianLearner(SceneLearner):
         corrections: ViewCorrections | None = None,
         stage: Stage | None = None,
         source: RunSource | None = None,
+        opaque: bool = False,
         device: torch.device = CPU,
     ) -> None:
         self.config = config
+        self.opaque = opaque
         self.levels = levels
         self.bounds = bounds
         self.corrections = corrections or ViewCorrections()
@@ -257,7 +262,7 @@ class GaussianLearner(SceneLearner):
         rates = self._learning_rates(share)
         factors = self.corrections.factors(view)
         measured = self.model.learn(
-            target, background=config.background, ssim=config.ssim, rates=rates, factors=factors
+            target, background=self._background(step), ssim=config.ssim, rates=rates, factors=factors
         )
         if not math.isfinite(measured.l1 + measured.ssim):
             self.skipped = self.skipped + 1
@@ -284,6 +289,13 @@ class GaussianLearner(SceneLearner):
             return
         for name, value in (("rgb", measured.squared), ("l1", measured.l1), ("ssim", measured.ssim)):
             self.means[name] = _MEANS_DECAY * self.means.get(name, value) + (1 - _MEANS_DECAY) * value
+
+    def _background(self, step: int) -> tuple[float, float, float]:
+        """The colour behind everything in a step: that of the config, or one of the step's own."""
+        if not self.opaque or self.stage.only is not None:
+            return self.config.background
+        red, green, blue = np.random.default_rng((self.config.seed, step, 2)).random(3).tolist()
+        return red, green, blue
 
     def _view(self, level: PhotographLevel, step: int) -> int:
         """The view of a step. Each epoch sees views once, in an order of its own: sharp ones, and all in

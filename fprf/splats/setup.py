@@ -110,6 +110,7 @@ def build(
         ),
         corrections=ViewCorrections(tones_of(facts), poses_of(facts, 1.0)),
         source=RunSource(known=known_of(scene, config.data, facts), points=origin),
+        opaque=not scene.alpha,
         device=device,
     )
     learner.begin_at(points, draw, far)

@@ -29,6 +29,7 @@ from fprf.rendering.cameras import Cameras
 from fprf.splats import photographs
 from fprf.splats import setup as training
 from fprf.splats.config import GaussiansConfig
+from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians, tensors_of
 from fprf.splats.learner import Bounds, GaussianLearner
@@ -63,7 +64,7 @@ def test_every_field_changes_something(
         width, height = scene.cameras.size[0].tolist()
         write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
         scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
-    end = STEPS if name in ("cap", "grow", "relocate_every", "pixels_per_gaussian") else 3
+    end = STEPS if name in ("background", "cap", "grow", "relocate_every", "pixels_per_gaussian") else 3
     first, second = (
         stepped(build(each, scene), 0, end) for each in (config, replace(config, **{name: SECOND[name]}))
     )
@@ -77,6 +78,19 @@ def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: 
         photograph.planes[:] = np.nan
     learner.step(0, 0.0)
     assert learner.figures()[2:5] == (1, 1, "the loss") and equal(learner.gaussians(), before)
+
+
+def test_dark_surfaces_become_opaque(config: GaussiansConfig, scene: ParsedScene, tmp_path: Path) -> None:
+    """Over black in every step a hole would be as good; photographs with transparency keep their holes."""
+    width, height = scene.cameras.size[0].tolist()
+    write_image(tmp_path / "black.png", np.zeros((height, width, 3), np.uint8))
+    black = replace(scene, paths=(tmp_path / "black.png",) * len(scene.paths))
+    holes = []
+    for alpha in (False, True):
+        found = stepped(build(config, replace(black, alpha=alpha))).gaussians()
+        camera = camera_of(scene.cameras, int(scene.train[0]))
+        holes.append(1 - float(draw(found, camera, antialiased=True).opacity.mean()))
+    assert 20 * holes[0] < holes[1]
 
 
 def test_colours_that_no_view_shows_fall_back_to_their_mean(
