@@ -20,7 +20,9 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.ops import backend, dense, triplane
+from fprf.fields.planes import PlanesField
+from fprf.interfaces import ContentField
+from fprf.ops import backend, dense, mixture, proposal, triplane
 from fprf.rendering.cameras import Cameras
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
@@ -36,7 +38,7 @@ from .subject import Subject, find, fresh_model, loop_of, stepper, test_view
 Patches = Sequence[tuple[object, str, object]]
 
 
-def never(*tensors: object) -> bool:
+def never(*tensors: object, learns: bool | None = None) -> bool:
     """No kernel applies."""
     return False
 
@@ -55,6 +57,9 @@ SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "usable", never)],
+    "proposals and middles": [(proposal, "usable", never)],
+    "styles of points": [(mixture, "usable", never)],
+    "content and decoder joined": [(PlanesField, "colour", ContentField.colour)],
     "guided features": [(FeatureStore, "at", plain_lookups)],
 }
 """What is replaced where a kernel is off."""
