@@ -78,7 +78,8 @@ def _directions(x, first, rows, centre, least, away, factor):
 
 @traced
 def softmax(score, at, factor, odds, softness, width):
-    """score[at : at + width] times a factor becomes shares; those below `faint` of the largest become 0.
+    """score[at : at + width] times a factor becomes shares but for a factor, which is returned; those below
+    `faint` of the largest become 0.
 
     `odds` hold what is added to scores, and behind it to logits; `softness` 1 / temperature and `faint`.
     """
@@ -105,10 +106,6 @@ def softmax(score, at, factor, odds, softness, width):
         store(score, at + k, kept)
         return [held[0] + kept, held[1] + logit * 0.0]
 
-    def divide(k, held):
-        store(score, at + k, load(score, at + k, WIDE) * held[0])
-        return held
-
     (found,) = repeat(width, [lowest], scale, by=WIDE)
     best = everywhere(largest(found), WIDE)
     (found,) = repeat(width, [lowest], weigh, by=WIDE)
@@ -116,8 +113,18 @@ def softmax(score, at, factor, odds, softness, width):
     zero = splat(score, 0.0, WIDE)
     found, unknown = repeat(width, [zero, zero], raised, by=WIDE)
     # A comparison passes over NaN; sums do not.
-    inverse = 1.0 / everywhere(total(found), WIDE) + everywhere(total(unknown), WIDE)
-    repeat(width, [inverse], divide, by=WIDE)
+    return largest(1.0 / everywhere(total(found), WIDE) + everywhere(total(unknown), WIDE))
+
+
+@traced
+def times(x, at, factor, out, to, count):
+    """out[to :] = x[at :] factor for `count` numbers, whole vectors."""
+
+    def step(k, held):
+        store(out, to + k, load(x, at + k, NARROW) * narrow(factor, NARROW))
+        return held
+
+    repeat(count, [splat(x, 0.0, NARROW)], step, by=NARROW)
 
 
 @_jit
@@ -130,6 +137,7 @@ def attention(x, centre, least, keys, odds, softness, out):
     width = len(odds) // 2
     points = len(x) // depth
     count = len(out) // points
+    vectors = count - count % NARROW
     for task in numba.prange((points + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         rows = min(BLOCK, points - first)
@@ -141,9 +149,11 @@ def attention(x, centre, least, keys, odds, softness, out):
         product(away, 0, keys, 0, width, none, 0, 0, score, depth, _NO_FLOOR)
         for r in range(rows):
             by = factor[r] if least >= _ZERO else _ONE
-            softmax(score, r * width, by, odds, softness, width)
-            for k in range(count):
-                out[(first + r) * count + k] = score[r * width + k]
+            whole = softmax(score, r * width, by, odds, softness, width)
+            to = (first + r) * count
+            times(score, r * width, whole, out, to, vectors)
+            for k in range(vectors, count):
+                out[to + k] = score[r * width + k] * whole
 
 
 @traced
