@@ -172,6 +172,7 @@ FASTER = {
     "train": "training with all features",
     "render": "rendering",
     "stylised, region-tone": "restyled rendering, `region-tone`",
+    "stylised, region-ot": "restyled rendering, `region-ot`",
     "stylised, local-adain": "restyled rendering, `local-adain`",
     "cached view restyled, region-tone": "a cached view in another style",
 }
