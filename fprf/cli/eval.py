@@ -26,6 +26,8 @@ _MAX_SIDE_PIXELS = 1600
 usual reports.
 """
 _TENSORBOARD_REMEDY = "name another --tensorboard, or replace it with --overwrite true"
+_FITTED = ("psnr", "cc_psnr", "ssim", "lpips")
+"""Figures that are said once more, as NAME_fitted_poses, after views' own poses were fitted."""
 _EVENTS = "events.out.tfevents.*"
 """Names of TensorBoard's event files."""
 
@@ -42,9 +44,9 @@ class EvalConfig(QualityConfig, OverwriteConfig):
     """Longest side in pixels at which views are judged; none = the photographs' own, up to 1600 pixels."""
     data: Path | None = None
     """Scene folder, where it has moved since training."""
-    fit_poses: bool = False
-    """Fit each view's own pose to its image first, the scene as it is: for captures whose poses are rough, or
-    were refined. metrics.json then says how far they were moved.
+    fit_poses: bool | None = None
+    """Judge views once more after each one's own pose was fitted to its image, the scene as it is.
+    metrics.json says the figures of both, and how far views were moved. none = where training refined poses.
     """
     images: bool = True
     """Write the renders to RUN/renders/SPLIT."""
@@ -83,6 +85,8 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
 
     Raises UsageError where the images at hand are not those of the run, or the split has no views.
     """
+    import torch
+
     from ..datamanagers.scene import at_origin
     from ..evaluation.metrics import judge
     from ..io.atomic import write_json
@@ -108,7 +112,7 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     captured = replace(captured, cameras=captured.cameras.scaled((longest.double() / wanted).clamp_min(1)))
     known = replace(known, cameras=known.cameras.resized(captured.cameras.size))
     views = known.views(config.split)
-    fitted = {}
+    fitted: dict[str, Any] = {}
     renders = {view: config.run / "renders" / config.split / f"{known.names[view]}.png" for view in views}
     table = config.run / "metrics.json"
     origin = Origin(
@@ -125,19 +129,28 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
 
     outputs = [table, *(renders.values() if config.images else ())]
     origin.check(outputs)
-    # Poses of held-out views were never refined with the scene: they may be fitted to it, which changes no
-    # colour of it.
+    given = opened.run.load_known().cameras
+    if config.fit_poses is None:
+        fit = not torch.equal(given.pose, opened.known.cameras.pose)
+    else:
+        fit = config.fit_poses
     with origin.writing(outputs), Display() as display:
-        if config.fit_poses:
+        masks = trained.reading.masks
+        found = judge(scene, known, captured, views, display.count, save, masks=masks)
+        # Photographs of held-out views had no part in training, so each may be a little beside its pose there:
+        # six numbers a view are fitted to the whole photograph, no colour is. Said beside, never instead.
+        if fit:
             moves = scene.fit_poses(captured, views, display.count)
-            known = replace(known, cameras=moved_cameras(known.cameras, moves))
+            moved = replace(known, cameras=moved_cameras(known.cameras, moves))
+            after = judge(scene, moved, captured, views, display.count, lambda *of: None, masks=masks)
             poses = {}
             for view in views:
                 turn = float(moves[view, :3].norm())
                 shift = float(moves[view, 3:].norm())
                 poses[known.names[view]] = {"turn_degrees": math.degrees(turn), "shift": shift}
-            fitted = {"fitted_poses": poses}
-        found = judge(scene, known, captured, views, display.count, save, masks=trained.reading.masks)
+            for name in _FITTED:
+                fitted[f"{name}_fitted_poses"] = after[name]
+            fitted["fitted_poses"] = poses
         metrics = {
             "method": opened.method,
             "scene": known.name,
@@ -195,6 +208,7 @@ def _print(metrics: dict[str, object]) -> None:
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
     units = {
         "psnr": "dB",
+        "psnr_fitted_poses": "dB, each view's own pose fitted to its photograph",
         "cc_psnr": "dB",
         "ssim": "",
         "lpips": "",
@@ -204,7 +218,9 @@ def _print(metrics: dict[str, object]) -> None:
     for key, unit in (
         units | {"kept_samples_share": "", "peak_rss_mib": "MiB", "train_seconds": "s"}
     ).items():
-        value = metrics[key]
+        value = metrics.get(key)
+        if value is None:
+            continue
         assert isinstance(value, float)
         table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", unit)
     used = metrics["used_share"]

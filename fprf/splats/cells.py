@@ -219,7 +219,8 @@ class CellPart(Part):
         start = self.start
         # Photographs, from where the whole scene found its views, as far as the cell's windows reach. Lengths
         # follow from the cell's own cameras: points of the whole scene say nothing about it.
-        scene = replace(self.scene, cameras=refined(self.scene.cameras, start), points=None, seen=None)
+        cameras = refined(self.scene.cameras, self.scene.train.tolist(), self.facts, start)
+        scene = replace(self.scene, cameras=cameras, points=None, seen=None)
         images, masks, skies = load_photographs(config, scene, list(cell.windows))
         images = crop(cell, images)
         masks = crop(cell, masks)

@@ -104,10 +104,11 @@ class GaussiansConfig(RunConfig):
     """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what
     they have in common. none = where exposures differ, as the capture says or as its sparse points show.
     """
-    poses: float = 0.0
+    poses: float | None = None
     """Refine the cameras' poses with the scene: how far a view may move whenever it is seen, in radians and
     in distances that views commonly see. It falls to a tenth. 0 = they are as the capture says, 0.002 suits
-    poses that are off by some pixels.
+    poses that are off by some pixels. none = 0.0005 where a trial finds, by pixels that it left out, that
+    poses are off; never in cells.
     """
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed
@@ -182,8 +183,10 @@ class GaussiansConfig(RunConfig):
             raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")
         for name in ("grow", "overview", "rate"):
             positive(name, getattr(self, name))
-        for name in ("ssim", "coarse", "grow", "poses"):
+        for name in ("ssim", "coarse", "grow"):
             between(name, getattr(self, name), 0.0, 1.0)
+        if self.poses is not None:
+            between("poses", self.poses, 0.0, 1.0)
         between("overview", self.overview, 0.0, 0.9)
         for part in self.background:
             between("background", part, 0.0, 1.0)
@@ -220,6 +223,13 @@ class GaussiansConfig(RunConfig):
         from .plan import plan
 
         return plan(self, scene, device)
+
+    @property
+    def may_refine(self) -> bool:
+        """Whether poses are refined, or a trial may say so."""
+        if self.poses is None:
+            return not self.cells.cuts
+        return self.poses > 0
 
     @property
     def most(self) -> int:

@@ -22,7 +22,7 @@ parameters, Adam's moments and the step are all the state there is.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -47,13 +47,14 @@ from ..rendering.cameras import Cameras
 from ..rendering.splines import rotations
 from ..scenes import SceneLearner
 from ..training import checkpoint
-from ..training.camera_optimizers import moved_cameras
+from ..training.camera_optimizers import moved_cameras, with_trend
 from ..training.facts import Facts
 from ..training.run import Known, Run
 from .config import GaussiansConfig
 from .gaussians import Gaussians, from_arrays, from_rows, from_tensors, tensors_of
 from .initial import Points, curve_order, spacing
 from .photographs import PhotographLevel
+from .pose_trial import trial_gain
 from .view_corrections import MOVES, ViewCorrections
 
 _START_OPACITY = 0.3
@@ -116,6 +117,14 @@ _HALF_DISTANCE_SHARE = 0.5
 """Distance of a half from the middle, as a share of the Gaussian's size; by eye."""
 _HALF_OPACITY_SHARE = 0.85
 """Opacity of a half, as a share of the Gaussian's, since both overlap; by eye."""
+_POSES_RATE = 5e-4
+"""Rate of poses where a trial found that they are off (`GaussiansConfig.poses`)."""
+_TRIAL_SHARE = 0.3
+"""Share of the training after which the trial is made: photographs of half the size are half learnt."""
+_MAX_TRIAL_VIEWS = 4
+"""Views that are not learnt from before the trial, at most; by eye."""
+_MIN_VIEWS_PER_TRIED = 4
+"""Training views for each of them, at least: with fewer than so many in all, nothing is tried."""
 _MEANS_DECAY = 0.95
 """Decay of running means of the losses; by eye."""
 CPU = torch.device("cpu")
@@ -255,6 +264,8 @@ class GaussianLearner(SceneLearner):
         share = self.stage.first + (self.stage.last - self.stage.first) * share
         # Coarse photographs first: half the size until `coarse`, a quarter until a third of that, and so on.
         level = self.levels[sum(share < config.coarse / 3**k for k in range(len(self.levels) - 1))]
+        if self.corrections.undecided and share >= _TRIAL_SHARE:
+            self._try_poses(level)
         view = self._view(level, step)
         target = self.corrections.moved(level[view], view)
         # Render, compare, and move every Gaussian that the view shows; nothing moves where the loss is not
@@ -277,7 +288,8 @@ class GaussianLearner(SceneLearner):
             self.bounds.limit_widths(self.model, step)
         if only != "poses":
             self.corrections.learn_tones(view, measured, config.rate, share)
-        self.corrections.learn_poses(view, target, measured, config.poses, share)
+        pace = _POSES_RATE if config.poses is None else config.poses
+        self.corrections.learn_poses(view, target, measured, pace, share)
         # Gaussians move to where views err, but not while the first ones settle, nor so late that nothing
         # learns them.
         due = (step + 1) % config.relocate_every == 0 and only is None
@@ -301,7 +313,7 @@ class GaussianLearner(SceneLearner):
         """The view of a step. Each epoch sees views once, in an order of its own: sharp ones, and all in
         every eighth.
         """
-        every = list(level)
+        every = self._learned(level)
         sharp = self._sharp(level)
         cycle, at = divmod(step, len(every) + (_BLURRED_EVERY_EPOCHS - 1) * len(sharp))
         epoch = _BLURRED_EVERY_EPOCHS * cycle
@@ -312,10 +324,42 @@ class GaussianLearner(SceneLearner):
             every = sharp
         return int(every[np.random.default_rng((self.config.seed, epoch)).permutation(len(every))[turn]])
 
+    def _try_poses(self, level: PhotographLevel) -> None:
+        """Decide whether poses are refined: where moving views that nothing was learnt from helps to show
+        them.
+        """
+        assert self.corrections.poses is not None  # it is undecided
+        views = self._tried(level)
+        # A copy, since a step changes moments.
+        model = trainable(self.model.count, self.bands, self.asked)
+        model.start(self.model.read())
+        gain = trial_gain(
+            model,
+            [level[view] for view in views],
+            [self.corrections.factors(view) for view in views],
+            background=self.config.background,
+            ssim=self.config.ssim,
+            reach=self.corrections.poses.reach,
+        )
+        self.corrections.decide(gain)
+
+    def _tried(self, level: PhotographLevel) -> list[int]:
+        """Views, evenly over all, that are not learnt from until they have said whether poses are refined."""
+        if not self.corrections.undecided:
+            return []
+        views = list(level)
+        count = min(_MAX_TRIAL_VIEWS, len(views) // _MIN_VIEWS_PER_TRIED)
+        return [views[(2 * number + 1) * len(views) // (2 * count)] for number in range(count)]
+
+    def _learned(self, level: PhotographLevel) -> list[int]:
+        """Views that are learnt from now."""
+        tried = self._tried(level)
+        return [view for view in level if view not in tried]
+
     def _sharp(self, level: PhotographLevel) -> list[int]:
         """Views that are not blurred at a scale; all where only poses or colours are learnt."""
         found: list[int] = []
-        for view in level:
+        for view in self._learned(level):
             if self.stage.only is not None or view not in level.blurred:
                 found.append(view)
         return found
@@ -382,6 +426,8 @@ class GaussianLearner(SceneLearner):
 
     def figures(self) -> Figures:
         means = self.means | {"gaussians": float(self.model.count)}
+        if self.corrections.gain is not None:
+            means["pose_trial_gain"] = self.corrections.gain
         return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
 
     def gaussians(self) -> Gaussians:
@@ -435,12 +481,12 @@ class GaussianLearner(SceneLearner):
         return line + left_out(self.asked)
 
 
-def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
-    """The cameras of all views where training put them."""
+def refined(cameras: Cameras, train: Sequence[int], facts: Facts, saved: checkpoint.Saved) -> Cameras:
+    """The cameras of all views where training put them; those that were held out follow the trend."""
     moves = saved.optimizer.get(MOVES)
-    if moves is None:
+    if moves is None or not bool(moves.any()):
         return cameras
-    return moved_cameras(cameras, moves)
+    return moved_cameras(cameras, with_trend(moves, cameras, train, facts.reach))
 
 
 def left_out(device: torch.device) -> str:

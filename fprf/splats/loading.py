@@ -74,7 +74,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     # common.
     captured = run.load_known()
     gaussians = from_tensors(saved.model)
-    known = replace(captured, cameras=refined(captured.cameras, saved))
+    known = replace(captured, cameras=refined(captured.cameras, captured.train, captured.facts, saved))
     tones = tones_of(known.facts)
     if tones is not None:
         kept = {name: saved.optimizer[f"tones.{name}.value"] for name, _ in tones.named_parameters()}

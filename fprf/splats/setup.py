@@ -108,7 +108,9 @@ def build(
             inside=None if sphere is None else sphere.encloses,
             limit_widths=limit_widths(scene, near, cells=config.cells.cuts, sphere=sphere),
         ),
-        corrections=ViewCorrections(tones_of(facts), poses_of(facts, 1.0)),
+        corrections=ViewCorrections(
+            tones_of(facts), poses_of(facts, 1.0), decided=config.poses is not None
+        ),
         source=RunSource(known=known_of(scene, config.data, facts), points=origin),
         opaque=not scene.alpha,
         device=device,
@@ -122,7 +124,7 @@ def light_and_poses(config: GaussiansConfig, scene: ParsedScene, image: Callable
     training view.
     """
     exposure = exposure_of(config.tones, scene, lambda view: torch.from_numpy(image(view)).float() / 255)
-    return facts_of(scene, config.background, exposure=exposure, poses=config.poses > 0)
+    return facts_of(scene, config.background, exposure=exposure, poses=config.may_refine)
 
 
 class _Sphere(NamedTuple):

@@ -25,6 +25,10 @@ _FIRST_DECAY = 0.9
 """Decay of Adam's first moment: that of Kingma and Ba 2015."""
 _SECOND_DECAY = 0.999
 """Decay of Adam's second moment: that of Kingma and Ba 2015."""
+_MIN_TRIAL_GAIN = 0.05
+"""Decibels that pixels which a trial left out must gain for poses to be refined."""
+_CHOICE = "poses.choice"
+"""Name in checkpoints of whether poses are refined: 0 not decided, 1 they are, 2 they are not."""
 _ADAM_EPS = 1e-8
 """Keeps a step finite where the gradient was always 0: that of Kingma and Ba 2015."""
 
@@ -60,9 +64,14 @@ class AdamState(NamedTuple):
 class ViewCorrections:
     """Factors of the views' colours (`tones`) and where each was taken (`poses`); None = not learnt."""
 
-    def __init__(self, tones: Tones | None = None, poses: Poses | None = None) -> None:
+    def __init__(
+        self, tones: Tones | None = None, poses: Poses | None = None, *, decided: bool = True
+    ) -> None:
+        """Where it is not `decided` whether poses are refined they stay until `decide`."""
         self.tones = tones
         self.poses = poses
+        self.choice = 1 if decided else 0
+        self.gain: float | None = None
         self.states: dict[str, AdamState] = {}
         for kind, module in (("tones", tones), ("poses", poses)):
             if module is not None:
@@ -71,11 +80,21 @@ class ViewCorrections:
 
     def moved(self, target: Target, view: int) -> Target:
         """A photograph, taken from where its pose is now."""
-        if self.poses is None:
+        if self.poses is None or self.choice != 1:
             return target
         move = self.poses.moved_by()[view]
         axes = rotated(torch.from_numpy(target.axes), move[:3].expand(3, 3))
         return target.seen_from(axes.numpy(), target.centre + move[3:].numpy())
+
+    @property
+    def undecided(self) -> bool:
+        """True where nothing has said yet whether poses are refined."""
+        return self.poses is not None and self.choice == 0
+
+    def decide(self, gain: float) -> None:
+        """Refine poses from here on where a trial gained enough, decibels."""
+        self.gain = gain
+        self.choice = 1 if gain >= _MIN_TRIAL_GAIN else 2
 
     def factors(self, view: int) -> Annotated[Floats, "3"] | None:
         """Factors of renders of a view; None = 1."""
@@ -101,7 +120,7 @@ class ViewCorrections:
     @torch.no_grad()
     def learn_poses(self, view: int, target: Target, measured: Learnt, rate: float, share: float) -> None:
         """Move the pose of a view, when a share of the training is over."""
-        if self.poses is None:
+        if self.poses is None or self.choice != 1:
             return
         # The gradient of a rotation vector is taken for that of a further turn: exact to first order in how
         # far views turn.
@@ -118,6 +137,7 @@ class ViewCorrections:
                 tensors[f"{name}.{key}"] = part.clone()
         if self.poses is not None:
             tensors[MOVES] = self.poses.moved_by()
+            tensors[_CHOICE] = torch.tensor(self.choice)
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
@@ -126,3 +146,5 @@ class ViewCorrections:
             for key, part in state._asdict().items():
                 if f"{name}.{key}" in tensors:
                     part.copy_(tensors[f"{name}.{key}"])
+        if _CHOICE in tensors:
+            self.choice = int(tensors[_CHOICE])

@@ -12,6 +12,7 @@ with its own views, without those seven directions of its own, so neighbours sta
 what the surroundings found.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -23,6 +24,14 @@ from ..rendering.cameras import Cameras
 from ..types import Rays
 from .facts import Facts
 
+_TREND_RIDGES = (0.1, 1.0, 10.0)
+"""Weights of the ridges that are tried, in views: those of some ten to a hundred."""
+_CONSTANT_RIDGE = 1e-9
+"""The part of a trend that is the same everywhere is not held back; above 0, so that it can be solved for one
+view.
+"""
+_MIN_SPREAD = 1e-12
+"""Mean distance below which views stand, or look, alike."""
 _MIN_SQUARED_ANGLE = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
 
@@ -106,6 +115,51 @@ def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
     for axis in range(3):
         axes.append(rotated(cameras.pose[:, :, axis], moves[:, :3]))
     return replace(cameras, pose=torch.stack([*axes, cameras.pose[:, :, 3] + moves[:, 3:]], -1))
+
+
+def with_trend(
+    moves: Annotated[Tensor, "V 6"], cameras: Cameras, learned: Sequence[int], reach: float
+) -> Annotated[Tensor, "V 6"]:
+    """Moves (radians, world units) in which views that were held out follow the trend of those `learned` from.
+
+    Refined cameras bend as a whole (a focal length that is a little off does that), and the scene with them:
+    a view that stays behind would be off by what its neighbours moved alike. The trend is a ridge regression
+    on where the given `cameras` stand and look. Features and ridge are those that best predict each learned
+    view from the others; there is no trend where none predicts better than no move. Photographs of views that
+    were held out have no part in it.
+    """
+    views = torch.as_tensor(list(learned), dtype=torch.int64)
+    others = torch.ones(len(moves), dtype=torch.bool)
+    others[views] = False
+    if not bool(moves[views].any()) or not bool(others.any()):
+        return moves
+    unit = torch.tensor([1.0, 1, 1, reach, reach, reach], dtype=torch.float64)
+    known = moves[views].double() / unit
+    one = torch.ones(len(moves), 1, dtype=torch.float64)
+    place = _spread(cameras.pose[:, :, 3], views)
+    look = _spread(cameras.pose[:, :, 2], views)
+    least = float(known.square().sum())
+    trend = torch.zeros_like(moves)
+    for features in (torch.cat([one, place], 1), torch.cat([one, place, look], 1)):
+        rows = features[views]
+        for ridge in _TREND_RIDGES:
+            penalty = ridge * torch.eye(features.shape[1], dtype=torch.float64)
+            penalty[0, 0] = _CONSTANT_RIDGE
+            weights = torch.linalg.solve(rows.T @ rows + penalty, rows.T)  # [features, learned]
+            # Each learned view as the others predict it: residuals over 1 - h (Allen 1974).
+            hat = (rows * weights.T).sum(1, keepdim=True)
+            left = float(((known - rows @ (weights @ known)) / (1 - hat)).square().sum())
+            if left < least:
+                least = left
+                trend = features @ (weights @ known) * unit
+    return torch.where(others[:, None], trend.to(moves), moves)
+
+
+def _spread(x: Annotated[Tensor, "V 3"], views: Annotated[Tensor, "M"]) -> Annotated[Tensor, "V 3"]:
+    """Vectors about the mean of some views, in units of their mean distance from it."""
+    apart = x.double().cpu() - x[views].double().cpu().mean(0)
+    spread: Tensor = apart / apart[views].norm(dim=1).mean().clamp_min(_MIN_SPREAD)
+    return spread
 
 
 def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:

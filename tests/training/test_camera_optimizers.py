@@ -12,7 +12,7 @@ from tiny_world import World, parameters, trained_for
 from torch import Tensor
 
 from fprf.rendering.cameras import rays_through
-from fprf.training.camera_optimizers import Poses, Tones, poses_of, rotated
+from fprf.training.camera_optimizers import Poses, Tones, poses_of, rotated, with_trend
 from fprf.training.driver import train
 from fprf.training.field_scene import load_run
 from fprf.types import Batch
@@ -81,6 +81,23 @@ def test_rays_are_those_of_the_refined_cameras(world: World) -> None:
     assert torch.equal(moved.pose[1], cameras.pose[1]) and not torch.allclose(moved.pose[5], cameras.pose[5])
     eye = moved.pose[:, :, :3].transpose(1, 2) @ moved.pose[:, :, :3]
     torch.testing.assert_close(eye, torch.eye(3, dtype=torch.float64).expand_as(eye), atol=1e-12, rtol=0)
+
+
+def test_views_that_were_held_out_follow_what_all_others_have_in_common(world: World) -> None:
+    cameras = world.prepared.scene.cameras
+    learned = list(range(1, len(cameras)))
+    place = cameras.pose[:, :, 3] - cameras.pose[1:, :, 3].mean(0)
+    moves = 1e-3 * torch.cat([place @ draw(3, 3, seed=1).double(), place @ draw(3, 3, seed=2).double()], 1)
+    given = moves.clone()
+    given[0] = 0
+    found = with_trend(given, cameras, learned, 1.0)
+    assert torch.equal(found[1:], moves[1:])
+    assert float((found[0] - moves[0]).norm()) < 0.3 * float(moves[0].norm())
+    # What single views did for themselves says nothing about others.
+    alone = given.clone()
+    alone[2:] = 0
+    assert not with_trend(alone, cameras, learned, 1.0)[0].any()
+    assert torch.equal(with_trend(torch.zeros_like(given), cameras, learned, 1.0), torch.zeros_like(given))
 
 
 def test_what_was_found_is_gone_on_with() -> None:

@@ -170,6 +170,11 @@ class Photograph(NamedTuple):
     sky: Annotated[Tensor, "H W"] | None
     """1 where it shows sky, 0 elsewhere; None = not known."""
 
+    def limited_to(self, mask: Annotated[NDArray[np.bool_], "H W"]) -> "Photograph":
+        """The same, of which only pixels of a mask count, as far as they did before."""
+        valid = torch.from_numpy(mask).to(self.colours)
+        return self._replace(valid=valid if self.valid is None else valid * self.valid)
+
 
 def target_on(
     device: torch.device,

@@ -82,6 +82,13 @@ class Target(NamedTuple):
         camera[16:19] = centre
         return self._replace(camera=camera)
 
+    def limited_to(self, mask: Annotated[NDArray[np.bool_], "H W"]) -> "Target":
+        """The same photograph, of which only pixels of a mask count, as far as they did before."""
+        if self.there is not None:
+            return self._replace(there=self.there.limited_to(mask))
+        valid = _planes(np.repeat(mask[..., None], 3, 2), 64)
+        return self._replace(valid=valid if self.valid is None else valid * self.valid)
+
     @property
     def area(self) -> int:
         """Pixels of a plane: whole tiles."""
