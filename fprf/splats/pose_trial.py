@@ -23,7 +23,7 @@ from .view_corrections import AdamState
 _BLOCK_PIXELS = 16
 """Side of the blocks of which each fourth is left out: smaller ones would be told by their neighbours."""
 _STEPS = 40
-"""Steps of each view; by eye."""
+"""Steps of each view: after 24 poses still tremble, and llff_flower gains 0.01 dB in place of 0.12."""
 _RATE = 1e-3
 """Radians, and distances that views commonly see, of the first step; by eye."""
 _FINAL_RATE_SHARE = 0.1
@@ -77,7 +77,8 @@ def left_out_blocks(width: int, height: int) -> Annotated[NDArray[np.bool_], "H 
     """Mask of a quarter of an image: one of each 2 x 2 blocks."""
     down = np.arange(height) // _BLOCK_PIXELS % 2 == 1
     across = np.arange(width) // _BLOCK_PIXELS % 2 == 1
-    return np.logical_and.outer(down, across)
+    mask: NDArray[np.bool_] = np.logical_and.outer(down, across)
+    return mask
 
 
 def _moved(target: Target, move: Annotated[Tensor, "6"], reach: float) -> Target:

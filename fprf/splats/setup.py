@@ -108,9 +108,7 @@ def build(
             inside=None if sphere is None else sphere.encloses,
             limit_widths=limit_widths(scene, near, cells=config.cells.cuts, sphere=sphere),
         ),
-        corrections=ViewCorrections(
-            tones_of(facts), poses_of(facts, 1.0), decided=config.poses is not None
-        ),
+        corrections=ViewCorrections(tones_of(facts), poses_of(facts, 1.0), decided=config.poses is not None),
         source=RunSource(known=known_of(scene, config.data, facts), points=origin),
         opaque=not scene.alpha,
         device=device,

@@ -289,7 +289,10 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert len([*(tmp_path / "film").glob("*.png")]) == 10
     assert main(["eval", str(run), "--fit-poses"]) == 0
     fitted = json.loads((run / "metrics.json").read_text())
-    assert len(fitted["fitted_poses"]) == fitted["views"] and fitted["psnr_fitted_poses"] > fitted["psnr"] == metrics["psnr"]
+    assert (
+        len(fitted["fitted_poses"]) == fitted["views"]
+        and fitted["psnr_fitted_poses"] > fitted["psnr"] == metrics["psnr"]
+    )
     assert main(["export", str(run), "--side", "64"]) == 0
     assert {f"mesh.{ending}" for ending in ("ply", "glb")} <= {
         path.name for path in (run / "exports").iterdir()
