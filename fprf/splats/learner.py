@@ -43,6 +43,7 @@ from ..ops.rasterise.training import (
     QUATERNION,
     Floats,
 )
+from ..progress import Display
 from ..rendering.cameras import Cameras
 from ..rendering.splines import rotations
 from ..scenes import SceneLearner
@@ -426,8 +427,6 @@ class GaussianLearner(SceneLearner):
 
     def figures(self) -> Figures:
         means = self.means | {"gaussians": float(self.model.count)}
-        if self.corrections.gain is not None:
-            means["pose_trial_gain"] = self.corrections.gain
         return Figures(means, self.pixels, self.skipped, self.failed, "the loss" if self.failed else "")
 
     def gaussians(self) -> Gaussians:
@@ -479,6 +478,12 @@ class GaussianLearner(SceneLearner):
                 f"; at most {steps} steps: {self.config.most_passes} passes over the photographs (--passes)"
             )
         return line + left_out(self.asked)
+
+    def finish(self, run: Run, display: Display) -> None:
+        """Say what became of poses."""
+        line = self.corrections.said()
+        if line:
+            display.say(line)
 
 
 def refined(cameras: Cameras, train: Sequence[int], facts: Facts, saved: checkpoint.Saved) -> Cameras:

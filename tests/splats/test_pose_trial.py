@@ -96,5 +96,6 @@ def test_it_goes_on_bit_for_bit_before_and_after_the_trial(
         again.load(stepped(build(sharp, off), 0, at).state())
         stepped(again, at, 120)
         assert equal(again.gaussians(), whole.gaussians()) and again.corrections.choice == 1
+        assert again.corrections.said() == whole.corrections.said() != ""
         assert torch.equal(again.state().optimizer["poses.moves"], whole.state().optimizer["poses.moves"])
     assert bool(whole.corrections.poses.moved_by().any())
