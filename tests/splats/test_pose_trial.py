@@ -86,7 +86,7 @@ def test_it_goes_on_bit_for_bit_before_and_after_the_trial(
     config: GaussiansConfig, scene: ParsedScene
 ) -> None:
     moves = torch.zeros(len(scene.paths), 6, dtype=torch.float64)
-    moves[scene.train, :3] = 0.1 * torch.randn(len(scene.train), 3, generator=torch.manual_seed(1)).double()
+    moves[scene.train, :3] = 0.05 * torch.randn(len(scene.train), 3, generator=torch.manual_seed(1)).double()
     off = replace(scene, cameras=moved_cameras(scene.cameras, moves))
     sharp = replace(config, coarse=0.0)  # blocks that are left out are larger than half of the town's views
     whole = stepped(build(sharp, off), 0, 120)
