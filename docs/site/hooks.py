@@ -59,9 +59,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
     """Links from docs/ to the rest of the repository lead to its copies on the site."""
     uri = page.file.src_uri
-    return (
-        markdown if uri in FRONT.values() or uri.startswith("verbs/") else moved(markdown, f"docs/{uri}", uri)
-    )
+    if uri in FRONT.values() or uri.startswith("verbs/"):
+        return markdown
+    # A page of the repository that others link to has links of its own.
+    source = uri.removeprefix("repository/") if uri.startswith("repository/") else f"docs/{uri}"
+    return moved(markdown, source, uri)
 
 
 def linked(file: File) -> set[str]:
