@@ -1,8 +1,9 @@
 """Points in mixtures: shares in regions or codes, and the maps of these, mixed.
 
 Each function is the compiled form of the plain torch that its caller holds beside it, and defines nothing:
-`usable` says where it applies. On 95 000 points, two cores, against plain torch: shares 3, maps of channels 4,
-matrices 2, nearest codes 5 times as fast.
+`usable` says where it applies. In a view of fox with 94 000 samples, two cores, milliseconds of plain torch and
+compiled: memberships 6.5 and 2.7, `region-ot` with its memberships 39 and 12, confidence 20.5 and 4.6, maps of
+colours 7.2 and 0.8.
 
 Letters: N points, D channels of semantics, K keys (regions or codes), C content channels.
 """

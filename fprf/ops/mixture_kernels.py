@@ -44,7 +44,7 @@ _LOG2_E = 1 / np.log(2)
 _LEAST_EXPONENT = -125.0
 """2^-125 stands for all smaller numbers."""
 MANY = 10 * BLOCK
-"""Points of a task whose members of a region are multiplied together: a tenth of the rows are padding."""
+"""Points of a task whose members of a region are multiplied together; by eye."""
 
 
 @traced

@@ -1,7 +1,7 @@
-"""Where to sample along rays, compiled: the edges that a plane field proposes, and the middles of steps.
+"""Places of samples along rays, compiled: the edges that a plane field proposes, and the middles of steps.
 
 Both do what the plain torch of `plugins/samplers` and `rendering/renderer` does, and define nothing: `usable`
-says where they apply. On 8040 rays of 48 steps, two cores, proposals are 3 times as fast, middles 6 times.
+says where they apply. With 8040 rays of 48 steps, two cores, the sampler takes 3.4 ms in the place of 8.5.
 
 R rays · E = S + 1 edges of S steps. Edges s in [0, 1] and ray parameters t as of `rendering.stepfun`.
 """
@@ -21,7 +21,7 @@ __all__ = ["Warp", "place", "propose", "usable"]
 
 
 class Warp(NamedTuple):
-    """How a space maps edges to distances, and points to the unit cube (`rendering.space.Space`)."""
+    """Maps of a space, from edges to distances and from points to the unit cube (`rendering.space.Space`)."""
 
     curved: bool
     """Distances are those of a contraction; else they are linear in s."""

@@ -226,7 +226,7 @@ class GaussiansConfig(RunConfig):
 
     @property
     def may_refine(self) -> bool:
-        """Whether poses are refined, or a trial may say so."""
+        """True where poses are refined, or a trial may say so."""
         if self.poses is None:
             return not self.cells.cuts
         return self.poses > 0

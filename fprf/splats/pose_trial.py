@@ -27,7 +27,7 @@ _STEPS = 40
 _RATE = 1e-3
 """Radians, and distances that views commonly see, of the first step; by eye."""
 _FINAL_RATE_SHARE = 0.1
-"""What is left of it at the last; by eye."""
+"""Share of it that is left at the last; by eye."""
 
 
 def trial_gain(
