@@ -29,6 +29,7 @@ from fprf.interfaces import (
 )
 from fprf.plugins import registry
 from fprf.plugins.decoders.config import DecoderConfig
+from fprf.plugins.decoders.decoders import MlpDecoder
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
 from fprf.plugins.executors.config import ExecutorConfig, SerialConfig
 from fprf.plugins.losses.config import LossTermConfig
@@ -89,6 +90,10 @@ class Linear(ContentField):
     def content(self, latent: Tensor, view: Tensor) -> Tensor:
         content = (latent + view) @ self.weight
         return {"channels": content[:, 1:], "rows": content - content.mean(0)}.get(self.wrong, content)
+
+    def colour(self, latent: Tensor, view: Tensor, decoder: Decoder) -> Tensor:
+        rgb = super().colour(latent, view, decoder)
+        return rgb / 2 if self.wrong == "shown" else rgb
 
     def penalties(self) -> dict[str, Tensor]:
         self.calls += 1
@@ -249,6 +254,13 @@ class Bright(Decoder):
         return content[:, :3]
 
 
+class Dimmed(MlpDecoder):
+    """More than its layers."""
+
+    def forward(self, content: Tensor) -> Tensor:
+        return super().forward(content) / 2
+
+
 class Averaging(Stylizer):
     @property
     def needs(self) -> Want:
@@ -283,6 +295,7 @@ BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
         testing.check_content_field,
         LinearConfig,
         {
+            "shown": "colour must be the content, decoded",
             "seed": "drawn from the seed alone",
             "batch": "must not depend on the others",
             "rows": "content: a point must not depend on the others",
@@ -357,6 +370,11 @@ OTHERS: list[tuple[Callable[[Any], None], Any, str]] = [
         partial(testing.check_decoder, encoder="any", channels=6),
         giving(DecoderConfig, Bright()),
         r"in \[0, 1\]",
+    ),
+    (
+        partial(testing.check_decoder, encoder="any", channels=6),
+        giving(DecoderConfig, Dimmed(6, 4)),
+        "layers must be what forward does",
     ),
     (testing.check_executor, giving(ExecutorConfig, Silent()), "must reach the caller"),
 ]

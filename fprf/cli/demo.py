@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from statistics import fmean
 
@@ -60,6 +59,7 @@ def run(args: list[str]) -> int:
     from ..datamanagers.images import load_preview
     from ..io.atomic import write_json
     from ..methods import fprf_splats
+    from ..page import GARDEN
     from ..page.writer import REFERENCE_PIXELS, Page, Reference, write_page
     from ..rendering.local_frame import offset_file
     from ..splats.files import write_gaussians
@@ -70,7 +70,6 @@ def run(args: list[str]) -> int:
     from ..training.run import Run
     from .eval import EvalConfig, evaluate
 
-    garden = Path(str(files("fprf") / "garden"))
     output = config.output / "run"
     captures = {}
     for name in (*LOOKS, ALL_TOGETHER):
@@ -81,7 +80,7 @@ def run(args: list[str]) -> int:
     outputs = [page, table, *captures.values(), *map(offset_file, captures.values())]
     origin.check(outputs)
     training = replace(
-        fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes
+        fprf_splats(), data=GARDEN, downscale=config.downscale, output=output, minutes=config.minutes
     )
     root = train(training, "fprf-splats")
     metrics = evaluate(EvalConfig(run=root, images=False))
@@ -90,7 +89,7 @@ def run(args: list[str]) -> int:
     views = opened.known.test
     names = {}
     for name in LOOKS:
-        names[garden / "references" / f"{name}.jpg"] = name
+        names[GARDEN / "references" / f"{name}.jpg"] = name
     chosen = []
     for path, name in names.items():
         chosen.append((name, StyleFile(StyleConfig(references=(path,)))))

@@ -129,8 +129,8 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
 
     outputs = [table, *(renders.values() if config.images else ())]
     origin.check(outputs)
-    given = opened.run.load_known().cameras
     if config.fit_poses is None:
+        given = opened.run.load_known().cameras
         fit = not torch.equal(given.pose, opened.known.cameras.pose)
     else:
         fit = config.fit_poses

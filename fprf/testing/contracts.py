@@ -40,6 +40,7 @@ from ..ops.harmonics import HARMONIC
 from ..plugins.codec import from_json, to_json
 from ..plugins.config import Need, PluginConfig
 from ..plugins.decoders.config import DecoderConfig
+from ..plugins.decoders.decoders import MlpDecoder
 from ..plugins.encoders.config import EncoderConfig, RandomConfig
 from ..plugins.executors.config import ExecutorConfig
 from ..plugins.losses.config import LossTermConfig
@@ -191,6 +192,12 @@ def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None
     decoder.double()
     content = content.double()
     follows(lambda: decoder(content), content, name)
+    # Fields join the first of the layers with a map of their own, and never ask `forward`.
+    if decoder.layers is not None:
+        value = content
+        for layer, (weight, bias) in enumerate(decoder.layers):
+            value = nn.functional.linear(value.relu() if layer > 0 else value, weight, bias)
+        same(torch.sigmoid(value), decoder(content), 1e-9, f"{name}: layers must be what forward does")
 
 
 def check_stylizer(config: StylizerConfig) -> None:
@@ -320,6 +327,12 @@ def check_content_field(config: ContentFieldConfig) -> None:
     latent = field.density(points).latent
     follows(lambda: field.density(points).density, points, f"{name}: density")
     follows(lambda: field.content(latent, view), points, f"{name}: content")
+    decoder = MlpDecoder(7, 5).double()
+    with torch.no_grad():
+        shown = field.colour(latent, view, decoder)
+        same(
+            shown, decoder(field.content(latent, view)), 1e-9, f"{name}: colour must be the content, decoded"
+        )
 
 
 def check_semantic_field(config: SemanticFieldConfig) -> None:
