@@ -21,7 +21,7 @@ from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
 from ..splats.learner import Bounds, GaussianLearner, Stage
 from ..splats.photographs import make_levels
-from ..splats.setup import find_near, scene_scale
+from ..splats.setup import find_near, limit_widths, scene_scale
 from ..style.look import Restyle
 from ..training.driver import Schedule, learn
 from .mesh import Maps
@@ -97,7 +97,11 @@ def fit_gaussians(
     points = seen_points(maps, max(1, round(_FIRST_GAUSSIANS_SHARE * limits.cap)))
     near = find_near(parsed, points)
     config = GaussiansConfig(cap=limits.cap, background=limits.background or (0.0, 0.0, 0.0))
-    bounds = Bounds(room=limits.cap, scene_scale=scene_scale(parsed))
+    bounds = Bounds(
+        room=limits.cap,
+        scene_scale=scene_scale(parsed),
+        limit_widths=limit_widths(parsed, near, cells=False),
+    )
     learner = None
     for number, look in enumerate(looks):
         shown = scene.restyled(look)
