@@ -15,8 +15,6 @@ Opening a file reads its header only, so that sizes are checked before anything 
 
 import re
 import struct
-import threading
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -42,7 +40,16 @@ from PIL.WebPImagePlugin import WebPImageFile
 from ..errors import DataError
 from ..io.transfer import picture_of
 from .colour_tags import ColourTag, boxes_tag, exif_tag, heif_tag, png_tag
-from .raw import develop, full_picture, raw_exif, raw_kind, raw_size, tiff_directories
+from .raw import (
+    develop,
+    full_picture,
+    parse_tags,
+    raw_exif,
+    raw_kind,
+    raw_size,
+    silent,
+    tiff_directories,
+)
 
 MAX_PIXELS = 100_000_000
 """Files that claim more are refused before they are decoded: a camera's largest, with room for copies."""
@@ -93,7 +100,6 @@ _GREY_SCALES = {"L;2": 85, "L;4": 17}
 """Factor to 8 bits of PNG's grey of 2 and 4 bits, by Pillow's raw mode."""
 _SAME_SRGB_LEVELS = 2
 """Levels of 255 up to which a profile moves colours and still is sRGB: profiles of sRGB differ by rounding."""
-_WARNINGS_LOCK = threading.Lock()
 
 
 class ImageHeader(NamedTuple):
@@ -177,7 +183,10 @@ def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
         file = _at_full_picture(file)
     file.seek(0)
     with decoding(kind, name), silent():
-        return kind, _READERS[kind][1](file)
+        image = _READERS[kind][1](file)
+        if isinstance(image, TiffImageFile):
+            parse_tags(image.tag_v2)
+    return kind, image
 
 
 def _sniffed(file: IO[bytes], name: object) -> tuple[bytes, str]:
@@ -500,13 +509,3 @@ def decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
         raise DataError(
             f"{name}: the {kind} data cannot be decoded: {reason}; copy or export the image again"
         ) from error
-
-
-@contextmanager
-def silent() -> Iterator[None]:
-    """Suppress Pillow's warnings of EXIF blocks. Filters are of the process, so one thread at a time changes
-    them.
-    """
-    with _WARNINGS_LOCK, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

@@ -9,8 +9,10 @@ would give each photograph of a scene an exposure of its own.
 """
 
 import re
+import threading
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from typing import IO, TYPE_CHECKING
 
@@ -32,6 +34,7 @@ RAW_SUFFIXES = frozenset(
 )
 """Suffixes of raw photographs in a folder's list, in lower case. What a file is, its content says."""
 
+_WARNINGS_LOCK = threading.Lock()
 _MAKERS_FIRST_BYTES: dict[str, bytes] = {
     "CR2": rb"(II\*\0|MM\0\*).{4}CR",
     "IIQ": rb"(II\*\0|MM\0\*)(IIII|MMMM)",
@@ -101,11 +104,32 @@ def _tiff_head(file: IO[bytes]) -> bytes:
     return head + file.read(8) if head[2:3] == b"+" else head
 
 
+@contextmanager
+def silent() -> Iterator[None]:
+    """Suppress Pillow's warnings of EXIF blocks. Filters are of the process, so one thread at a time changes
+    them.
+    """
+    with _WARNINGS_LOCK, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def parse_tags(directory: ImageFileDirectory_v2) -> None:
+    """Parse all tags of a directory now, within `silent`: Pillow warns of odd ones when they are first asked
+    for. Damaged ones raise only where they are needed.
+    """
+    for tag in list(directory):
+        with suppress(Exception):
+            directory[tag]
+
+
 def _directory_at(file: IO[bytes], offset: int) -> ImageFileDirectory_v2:
     """A directory of an open TIFF file; what is damaged in it is absent."""
     directory = ImageFileDirectory_v2(_tiff_head(file))
     file.seek(offset)
-    directory.load(file)
+    with silent():
+        directory.load(file)
+        parse_tags(directory)
     return directory
 
 

@@ -108,6 +108,24 @@ KINDS: dict[str, tuple[bytes, np.ndarray, int]] = {
 }
 
 
+def two_compressions(data: bytes) -> bytes:
+    """A TIFF file whose tag of the compression, 259, says that it has two values, of which Pillow warns."""
+    changed = bytearray(data)
+    (directory,) = struct.unpack_from("<I", data, 4)
+    for entry in range(struct.unpack_from("<H", data, directory)[0]):
+        at = directory + 2 + 12 * entry
+        if struct.unpack_from("<H", data, at)[0] == 259:
+            struct.pack_into("<I", changed, at + 4, 2)
+    assert changed != data
+    return bytes(changed)
+
+
+def test_odd_tags_of_a_tiff_are_no_warnings(tmp_path: Path) -> None:
+    path = tmp_path / "odd.tif"
+    path.write_bytes(two_compressions(saved(PICTURE, "TIFF")))
+    assert np.array_equal(load_image(path), COLOURS)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_file_gives_its_pixels(tmp_path: Path, kind: str) -> None:
     data, wanted, tolerance = KINDS[kind]
