@@ -187,6 +187,30 @@ def test_a_page_keeps_up_with_its_server(world: World) -> None:
             page.wait_for_function("() => !window.before && window.fprf")
 
 
+def test_a_double_click_picks_nothing_and_escape_undoes_a_pick(world: World) -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        session = server.open(lambda: Viewed(seen(ball(400, 2)), "ball", 1), warm=False)
+        session.upload(world.references[0].read_bytes(), "dusk.png")
+        with front(server.address) as page:
+            state(page, "state.shelf.length === 1")
+            box = page.locator("#canvas").bounding_box()
+            middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+            page.evaluate(
+                """() => {
+              const tell = fprf.live.tell.bind(fprf.live);
+              window.told = [];
+              fprf.live.tell = (type, more) => { told.push(type); tell(type, more); };
+            }"""
+            )
+            page.mouse.dblclick(*middle)
+            page.wait_for_timeout(800)
+            assert "pick" not in page.evaluate("() => told")
+            page.mouse.click(*middle)
+            state(page, "state.picked !== null")
+            page.keyboard.press("Escape")
+            state(page, "state.picked === null")
+
+
 def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:
     shipped = Path(str(files("fprf") / "garden"))
     given = tmp_path / "garden"

@@ -160,7 +160,7 @@ def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
 def test_the_whole_page_works_by_keyboard(page: Any) -> None:
     page.keyboard.press("1")
     reached = []
-    for _ in range(14):
+    for _ in range(16):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("() => document.activeElement.id || document.activeElement.className"))
     assert {"canvas", "next", "how", "look", "from", "mix", "wiping"} <= set(reached)
@@ -186,6 +186,39 @@ def test_a_pixel_has_a_point_in_space(page: Any) -> None:
     assert page.evaluate("([x, y]) => fprf.place.point(x, y)", (box["x"] + 2, box["y"] + 2)) is None
     page.mouse.dblclick(*middle)
     page.wait_for_function("() => !fprf.place.flight")
+
+
+def test_the_camera_cannot_get_lost(page: Any) -> None:
+    start = page.evaluate(POSE)
+    page.evaluate("() => { fprf.place.point = () => [4000, -9000, 500]; }")  # the sky
+    for _ in range(6):
+        page.evaluate("() => fprf.place.focus(100, 100)")
+        page.wait_for_function("() => !fprf.place.flight")
+    far, radius, distance = page.evaluate(
+        """() => {
+      const { camera, scene } = fprf.place, { centre, radius } = scene.reach;
+      return [Math.hypot(...plus(camera.place, centre, -1)), radius, camera.distance];
+    }"""
+    )
+    assert far <= radius * 1.001 and distance <= radius
+    page.locator("#reset").click()
+    page.wait_for_function("() => !fprf.place.flight")
+    assert np.allclose(start, page.evaluate(POSE), atol=1e-3)
+
+
+def test_keys_steer_wherever_one_has_clicked_but_not_in_a_text(page: Any) -> None:
+    page.keyboard.press("1")
+    page.locator("#mix").click()
+    before = page.evaluate(POSE)
+    moved = "(v) => [...fprf.place.camera.view].some((x, i) => Math.abs(x - v[i]) > 1e-3)"
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_timeout(200)
+    assert not page.evaluate(moved, before), "arrows are the slider's"
+    page.keyboard.down("w")
+    page.wait_for_function(moved, arg=before)
+    page.keyboard.up("w")
+    page.keyboard.press("0")
+    assert page.locator(".look[aria-pressed=true]").inner_text() == "Captured"
 
 
 def test_a_lost_context_comes_back(page: Any) -> None:

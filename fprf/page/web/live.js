@@ -203,6 +203,9 @@ class Live {
     };
     this.place.listeners.drawn = () => at("place").classList.add("drawn");
     this.stage = new Stage(this.place, [{ name: "Captured" }]);
+    this.stage.listeners.escape = () => {
+      if (this.state?.picked) this.tell("region", { action: "close" });
+    };
     this.stage.listeners.chosen = (name) => {
       if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" });
     };

@@ -32,6 +32,11 @@ class Pictures {
     this.at = (this.at + by + count) % count;
     this.show({});
   }
+
+  home() {
+    this.at = 0;
+    this.show({});
+  }
 }
 
 // The controls of a stage: which style, from which other one, how far, or a line between both.
@@ -43,6 +48,7 @@ class Stage {
     at("wiping").onclick = () => this.set({ wiping: !this.wiping, ...(this.wiping ? {} : { line: 0.5 }) });
     at("back").onclick = () => this.place.step(-1);
     at("next").onclick = () => this.place.step(1);
+    at("reset").onclick = () => this.place.home();
     at("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : this.root.requestFullscreen?.());
     at("full").hidden = !this.root.requestFullscreen;
     at("how").onclick = () => { at("help").hidden = !at("help").hidden; };
@@ -110,17 +116,19 @@ class Stage {
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.("input:not([type=range]), select, textarea")) return;
     const digit = /^Digit(\d)$/.exec(event.code);
     const style = digit && this.styles[Number(digit[1])];
     if (style) this.choose(style.name);
     else if (event.key === "[" || event.key === "]") this.set({ amount: Math.min(1, Math.max(0, this.amount + (event.key === "]" ? 0.1 : -0.1))) });
     else if (event.code === "KeyC") this.set({ wiping: !this.wiping });
     else if (event.code === "KeyV") this.place.step(event.shiftKey ? -1 : 1);
-    else if (event.code === "KeyR") this.place.step(0);
+    else if (event.code === "KeyR") this.place.home();
     else if (event.key === "?" || event.code === "KeyH") at("help").hidden = !at("help").hidden;
-    else if (event.key === "Escape") at("help").hidden = true;
-    else return;
+    else if (event.key === "Escape") {
+      at("help").hidden = true;
+      this.listeners.escape?.();
+    } else return;
     event.preventDefault();
   }
 }

@@ -4,6 +4,7 @@ const FRAME = 90; // milliseconds that a frame of a moving camera may take
 const REST = 220; // milliseconds without a move, after which the exact picture is drawn
 const SHARES = [1, 0.75, 0.5, 0.35, 0.25];
 const EDGE = 4096; // pixels a side of the canvas, at most
+const CLICK_MS = 280; // until a click is known not to be the first half of a double click; by eye
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -108,7 +109,9 @@ class Place {
     this.touch(false);
   }
 
+  // Fly to a camera, or to where one may go that is nearest to it.
   go(camera, seconds = 0.7) {
+    this.within(camera);
     const from = this.camera.copy(), start = performance.now();
     if (matchMedia("(prefers-reduced-motion: reduce)").matches) seconds = 0;
     this.flight = (now) => {
@@ -124,6 +127,12 @@ class Place {
     const count = this.scene.cameras.length;
     this.at = (this.at + by + count) % count;
     this.go(new Camera(this.scene.cameras[this.at]));
+  }
+
+  // Back to where the page began.
+  home() {
+    this.at = 0;
+    this.step(0);
   }
 
   frame(now) {
@@ -184,17 +193,29 @@ class Place {
     camera.axes[2] = forward;
     camera.axes[0] = unit(cross(camera.axes[1], forward));
     camera.axes[1] = cross(forward, camera.axes[0]);
-    camera.distance = Math.hypot(...to);
+    // Of the sky, and of all that lies beyond where one may go, the direction alone counts.
+    camera.distance = Math.min(Math.hypot(...to), this.scene.reach.radius);
     camera.move(0, 0, 0.25 * camera.distance);
     camera.distance *= 0.75;
     this.go(camera);
   }
 
   // Nobody leaves what was captured by more than its own size.
+  within(camera) {
+    const { centre, radius } = this.scene.reach, away = plus(camera.place, centre, -1), far = Math.hypot(...away);
+    if (far > radius) camera.place = plus(centre, away, radius / far);
+  }
+
   keep() {
-    const { centre, radius } = this.scene.reach, away = plus(this.camera.place, centre, -1), far = Math.hypot(...away);
-    if (far > radius) this.camera.place = plus(centre, away, radius / far);
+    this.within(this.camera);
     this.touch();
+  }
+
+  // Keys that steer, wherever the focus is on a page that is the stage alone, else within the stage. A slider keeps its arrows.
+  steers({ target, code }) {
+    if (!(target instanceof Element) || target.closest("input:not([type=range]), select, textarea")) return false;
+    if (target !== this.canvas && target.closest("[type=range], [role=slider]") && code.startsWith("Arrow")) return false;
+    return this.scene.alone || Boolean(target.closest(".place"));
   }
 
   controls() {
@@ -210,6 +231,7 @@ class Place {
       pressed = pointers.size === 1 ? { x: event.clientX, y: event.clientY, far: 0 } : null;
       gap = 0;
       this.flight = null;
+      clearTimeout(this.picking);
     });
     canvas.addEventListener("pointermove", (event) => {
       const before = pointers.get(event.pointerId);
@@ -228,26 +250,32 @@ class Place {
     });
     const up = (event) => {
       pointers.delete(event.pointerId);
-      if (event.type === "pointerup" && pressed && pressed.far < 5) this.listeners.pick?.(event.clientX, event.clientY);
+      if (event.type === "pointerup" && pressed && pressed.far < 5) {
+        const { clientX, clientY } = event;
+        this.picking = setTimeout(() => this.listeners.pick?.(clientX, clientY), CLICK_MS);
+      }
       pressed = null;
     };
     canvas.addEventListener("pointerup", up);
     canvas.addEventListener("pointercancel", up);
-    canvas.addEventListener("dblclick", (event) => this.focus(event.clientX, event.clientY));
+    canvas.addEventListener("dblclick", (event) => {
+      clearTimeout(this.picking);
+      this.focus(event.clientX, event.clientY);
+    });
     canvas.addEventListener("wheel", (event) => {
       if (!this.scene.alone && document.activeElement !== canvas) return; // a page is scrolled past it
       event.preventDefault();
       this.camera.move(0, 0, this.camera.distance * (1 - Math.exp(event.deltaY * (event.deltaMode ? 0.03 : 0.0012))));
       this.keep();
     }, { passive: false });
-    canvas.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.code]) return;
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || !KEYS[event.code] || !this.steers(event)) return;
       event.preventDefault();
       this.flight = null;
       this.keys.add(event.code);
     });
-    canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
-    canvas.addEventListener("blur", () => this.keys.clear());
+    addEventListener("keyup", (event) => this.keys.delete(event.code));
+    addEventListener("blur", () => this.keys.clear());
   }
 
   // Keys that are held.
