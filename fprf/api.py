@@ -18,11 +18,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from .checks import at_least, between
 from .errors import UsageError
-from .io.images import Picture, to_uint8, write_image
+from .io.atomic import write_bytes
+from .io.images import Picture, encode, to_uint8, write_image
+from .io.memory_pictures import Photograph, is_temporary, photograph_files
 from .io.overwriting import Origin
 from .io.paths import PathLike, as_path, as_paths
 from .plugins.conversion import three_numbers
@@ -78,6 +81,15 @@ class Shot:
     def pixels(self) -> Picture:
         """The colours as uint8 RGB, a numpy array [H W 3]."""
         return to_uint8(self.rgb)
+
+    @property
+    def image(self) -> Image.Image:
+        """The colours as a picture of Pillow."""
+        return Image.fromarray(self.pixels)
+
+    def _repr_png_(self) -> bytes:
+        """The picture in a notebook."""
+        return encode(self.pixels, "png")
 
     def save(self, path: PathLike, *, overwrite: bool = False) -> None:
         """Write the colours: .png, .jpg or .webp. Raises DataError for another ending, UsageError where something
@@ -167,21 +179,27 @@ class TrainedScene:
 
     def stylize(
         self,
-        references: PathLike | Sequence[PathLike],
+        references: Photograph | Sequence[Photograph],
         *,
         weights: Sequence[float] = (),
-        strength: float = 1.0,
-        luminance: float = 0.0,
+        masks: PathLike | Sequence[PathLike] = (),
+        stylizer: StylizerConfig | None = None,
         clusters: int = 20,
         blend: float = 0.1,
-        stylizer: StylizerConfig | None = None,
+        strength: float = 1.0,
+        luminance: float = 0.0,
+        bold: float = 0.5,
         pin: str | Sequence[str] = (),
         forbid: str | Sequence[str] = (),
         keep: str | Sequence[str] = (),
+        region_strength: str | Sequence[str] = (),
+        keep_below: float | None = None,
+        between: PathLike | None = None,
+        at: float = 0.5,
         preset: str | None = None,
     ) -> "TrainedScene":
-        """The scene in the style of one photograph or several, or of all in a folder; all arguments but `preset`
-        are fields of `StyleConfig`.
+        """The scene in the style of one photograph or several, or of all in a folder: files, pictures of Pillow or
+        arrays. All arguments but `preset` are fields of `StyleConfig`, which explains them.
 
         A preset, such as "gentle", replaces what it sets (`fprf.style.config.PRESETS`).
 
@@ -189,16 +207,22 @@ class TrainedScene:
         DataError for unreadable photographs, WeightsError where the encoders at hand are not the scene's.
         """
         style = StyleConfig(
-            references=as_paths(references),
+            references=photograph_files(references),
             weights=tuple(weights),
-            strength=strength,
-            luminance=luminance,
+            masks=as_paths(masks),
+            stylizer=RegionToneConfig() if stylizer is None else stylizer,
             clusters=clusters,
             blend=blend,
-            stylizer=RegionToneConfig() if stylizer is None else stylizer,
+            strength=strength,
+            luminance=luminance,
+            bold=bold,
             pin=_texts(pin),
             forbid=_texts(forbid),
             keep=_texts(keep),
+            region_strength=_texts(region_strength),
+            keep_below=keep_below,
+            between=None if between is None else as_path(between),
+            at=at,
         )
         return self.apply(style if preset is None else with_preset(style, preset))
 
@@ -235,8 +259,9 @@ class TrainedScene:
         return replace(self, styled=None)
 
     def save_style(self, path: PathLike, *, overwrite: bool = False) -> None:
-        """Write the style as a style.json. Raises UsageError without one, for a mix made by `towards`, and where
-        something else is there already, unless `overwrite` is true.
+        """Write the style as a style.json; references that were pictures in memory go beside it, as PNG. Raises
+        UsageError without a style, for a mix made by `towards`, and where something else is there already, unless
+        `overwrite` is true.
         """
         styled = self._style("save_style")
         if len(styled.restyle.parts) > 1 and styled.controls.saved.style.between is None:
@@ -244,8 +269,16 @@ class TrainedScene:
                 "save_style: a mix has no file of its own; save both styles, and give one `between` and `at`"
             )
         file = as_path(path)
-        with replace(self.origin, overwrite=overwrite).writing([file]):
-            write_style(file, styled.controls.saved)
+        saved = styled.controls.saved
+        beside = {}
+        for number, reference in enumerate(saved.style.references):
+            if is_temporary(reference):
+                beside[reference] = file.with_name(f"{file.stem}-{number}.png")
+        references = tuple(beside.get(each, each) for each in saved.style.references)
+        with replace(self.origin, overwrite=overwrite).writing([file, *beside.values()]):
+            for picture, copy in beside.items():
+                write_bytes(copy, picture.read_bytes())
+            write_style(file, saved._replace(style=replace(saved.style, references=references)))
 
     def _repr_html_(self) -> str:
         """The scene in a notebook: a page to walk through, of Gaussians; a picture of a field."""
@@ -350,27 +383,53 @@ class FinishedCapture:
 
     def restyled(
         self,
-        references: PathLike | Sequence[PathLike],
+        references: Photograph | Sequence[Photograph],
         *,
         weights: Sequence[float] = (),
+        masks: PathLike | Sequence[PathLike] = (),
+        stylizer: StylizerConfig | None = None,
+        clusters: int = 20,
+        blend: float = 0.1,
         strength: float = 1.0,
         luminance: float = 0.0,
+        bold: float = 0.5,
+        pin: str | Sequence[str] = (),
+        forbid: str | Sequence[str] = (),
+        keep: str | Sequence[str] = (),
+        region_strength: str | Sequence[str] = (),
+        keep_below: float | None = None,
+        between: PathLike | None = None,
+        at: float = 0.5,
+        preset: str | None = None,
         match_light: bool = False,
-        stylizer: StylizerConfig | None = None,
     ) -> "FinishedCapture":
-        """The capture, as it was read, in the style of photographs; arguments as those of `fprf restyle`.
+        """The capture, as it was read, in the style of photographs; arguments as those of `stylize` of a trained
+        scene. `match_light` takes exposure and white balance alone.
 
         Raises UsageError for no references, DataError for unreadable photographs and where nothing can be
         seen.
         """
         seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
         style = StyleConfig(
-            references=as_paths(references),
+            references=photograph_files(references),
             weights=tuple(weights),
+            masks=as_paths(masks),
+            stylizer=RegionToneConfig(centred=False) if stylizer is None else stylizer,
+            clusters=clusters,
+            blend=blend,
             strength=strength,
             luminance=luminance,
-            stylizer=RegionToneConfig(centred=False) if stylizer is None else stylizer,
+            bold=bold,
+            pin=_texts(pin),
+            forbid=_texts(forbid),
+            keep=_texts(keep),
+            region_strength=_texts(region_strength),
+            keep_below=keep_below,
+            between=None if between is None else as_path(between),
+            at=at,
         )
+        if preset is not None:
+            style = with_preset(style, preset)
         styled = apply_style(seen().scene, StyleFile(style))
         styled = light_alone(styled) if match_light else styled
         harmonics = seen().harmonics(0, self.capture, styled.restyle)

@@ -10,6 +10,7 @@
       CheckpointError         a run folder or a checkpoint
       NumericsError           a value that is not finite where it must be
       OutOfMemoryError        not enough memory, and nothing left that could be made smaller
+      Stopped                 work that whoever was told of its progress has ended
 
 The command line turns each into one line on standard error and exit code 2.
 """
@@ -60,3 +61,12 @@ class NumericsError(FprfError):
 
 class OutOfMemoryError(FprfError):
     """Not enough memory, and nothing left that could be made smaller."""
+
+
+class Stopped(FprfError):
+    """Work that was ended from outside: raise it in a `progress` function. What was done is kept, and the same call
+    goes on from there.
+    """
+
+    def __init__(self, text: str = "stopped; the same call goes on from here") -> None:
+        super().__init__(text)

@@ -1,16 +1,23 @@
-"""Progress of a long command: a live line on a terminal, one JSON line every few seconds elsewhere."""
+"""Progress of a long command: a live line on a terminal and in a notebook, one JSON line every few seconds
+elsewhere.
+"""
 
+import html
 import json
 import sys
 import time
+from collections.abc import Callable
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
 LINE_SECONDS = 5.0
 """Time between JSON lines where standard error is no terminal, and in events.jsonl."""
+
+CELL_SECONDS = 0.25
+"""Time between two drawings of a bar in a notebook; by eye."""
 
 
 class Report(NamedTuple):
@@ -31,13 +38,32 @@ class Report(NamedTuple):
     """Steps skipped because their loss or a gradient was not finite."""
 
 
-class Display:
-    """A context manager; `quiet` shows nothing."""
+class Progressed(NamedTuple):
+    """How far a long piece of work is, as listeners are told."""
 
-    def __init__(self, *, quiet: bool = False) -> None:
+    what: str
+    """The step that is being taken, such as "training"."""
+    share: float
+    """Share of that step, 0 to 1."""
+    detail: str
+    """Counts, quality and the time left, as a terminal shows them."""
+
+
+Listener = Callable[[Progressed], object]
+"""Called with each change, by the thread that works. It may raise `errors.Stopped`."""
+
+
+class Display:
+    """A context manager; `quiet` shows nothing, `listener` is told all the same."""
+
+    def __init__(self, *, quiet: bool = False, listener: Listener | None = None) -> None:
         self.console = Console(stderr=True, highlight=False)
         self.quiet = quiet
+        self.listener = listener
         self.live = self.console.is_terminal and not quiet
+        self.cell = None
+        if self.console.is_jupyter and not quiet:
+            self.cell = _Cell()
         self.progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -65,6 +91,8 @@ class Display:
         """One line that stays."""
         if self.live:
             self.progress.console.print(text, markup=False)
+        elif self.cell is not None:
+            print(text, file=sys.stderr)
         elif not self.quiet:
             self._line({"event": text})
 
@@ -101,13 +129,17 @@ class Display:
             )
 
     def _bar(self, what: str, share: float, detail: str) -> None:
+        if self.listener is not None:
+            self.listener(Progressed(what, min(1.0, share), detail))
+        if self.cell is not None:
+            self.cell.show(what, share, detail)
         if what != self.what or self.task is None:
             self.what = what
             self.task = self.progress.add_task(what, total=1.0, detail=detail)
         self.progress.update(self.task, completed=min(1.0, share), detail=detail)
 
     def _due(self, last: bool) -> bool:
-        if self.quiet:
+        if self.quiet or self.cell is not None:
             return False
         now = time.perf_counter()
         if now - self.last < LINE_SECONDS and not last:
@@ -117,6 +149,32 @@ class Display:
 
     def _line(self, event: dict[str, object]) -> None:
         print(json.dumps(event), file=sys.stderr, flush=True)
+
+
+class _Cell:
+    """A bar below a notebook's cell, one for each step; drawn by IPython, without widgets."""
+
+    def __init__(self) -> None:
+        self.handle: Any = None
+        self.what = ""
+        self.last = 0.0
+
+    def show(self, what: str, share: float, detail: str) -> None:
+        """Draw the bar; at most a few times a second."""
+        from IPython.display import HTML, display  # there is one: the console runs in it
+
+        now = time.perf_counter()
+        begins = what != self.what
+        if not begins and share < 1 and now - self.last < CELL_SECONDS:
+            return
+        self.last = now
+        bar = f'<progress value="{min(1.0, share):.4f}"></progress>'
+        shown = HTML(f"{bar} {html.escape(what)} {share:.0%} {html.escape(detail)}")
+        if begins:
+            self.what = what
+            self.handle = display(shown, display_id=True)
+        else:
+            self.handle.update(shown)
 
 
 def _clock(seconds: float) -> str:

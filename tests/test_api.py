@@ -1,4 +1,6 @@
+import dataclasses
 import html
+import inspect
 import json
 import shutil
 from collections.abc import Callable
@@ -9,12 +11,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tiny_world import World
 
 import fprf
-from fprf.api import TrainedScene
+from fprf.api import FinishedCapture, TrainedScene
 from fprf.cli import main as cli
 from fprf.errors import CheckpointError, ConfigError, DataError, FprfError, UsageError
+from fprf.io.memory_pictures import photograph_files
+from fprf.progress import Progressed
 from fprf.rendering.cameras import project
 from fprf.style.config import StyleConfig
 
@@ -131,3 +136,89 @@ def test_a_notebook_shows_the_scene_as_a_page(scene: TrainedScene, world: World)
         page = html.unescape(frame.partition('srcdoc="')[2].partition('" sandbox')[0])
         data = json.loads(page.partition('id="data">')[2].partition("</script>")[0])
         assert [style["name"] for style in data["styles"]] == names
+
+
+@pytest.mark.parametrize("method", [TrainedScene.stylize, FinishedCapture.restyled])
+def test_every_field_of_a_style_is_an_argument(method: Callable[..., object]) -> None:
+    given = dict(inspect.signature(method).parameters)
+    for name in ("self", "preset", "match_light"):
+        given.pop(name, None)
+    fields = {each.name: each for each in dataclasses.fields(StyleConfig)}
+    assert given.keys() == fields.keys()
+    for name, parameter in given.items():
+        # No slot as a default: which stylizer it is depends on the scene.
+        own = None if name == "stylizer" else fields[name].default
+        assert name == "references" or parameter.default == own, name
+
+
+def test_a_reference_may_be_a_picture_in_memory(scene: TrainedScene, world: World, tmp_path: Path) -> None:
+    file = world.references[0]
+    by_file = scene.stylize(file).render(0).rgb
+    picture = Image.open(file)
+    floats = np.asarray(picture.convert("RGB"), np.float32) / 255
+    for held in (picture, np.asarray(picture), floats, torch.from_numpy(floats), [picture]):
+        assert torch.equal(scene.stylize(held).render(0).rgb, by_file)
+    both = scene.stylize([file, picture.rotate(180)], pin="0=0")
+    assert both.references[0] == file.name and len(both.references) == 2
+    # A style that is saved carries them along.
+    both.save_style(tmp_path / "mine.json")
+    assert {path.name for path in tmp_path.iterdir()} >= {"mine.json", "mine-1.png"}
+    assert torch.equal(scene.apply(tmp_path / "mine.json").render(0).rgb, both.render(0).rgb)
+    for wrong in (np.zeros((4, 4), np.uint8), np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3), np.int64)):
+        with pytest.raises(DataError, match="references: "):
+            scene.stylize(wrong)
+
+
+def test_pictures_are_upright_and_keep_profile_and_transparency(tmp_path: Path) -> None:
+    turned = Image.fromarray(np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    turned.save(tmp_path / "turned.png", exif=exif, icc_profile=b"a profile")
+    with Image.open(tmp_path / "turned.png") as opened:
+        (file,) = photograph_files(opened)
+    with Image.open(file) as found:
+        assert found.size == (2, 4) and found.info["icc_profile"] == b"a profile"
+    (clear,) = photograph_files(Image.new("RGBA", (3, 3), (9, 8, 7, 0)))
+    with Image.open(clear) as found:
+        assert found.mode == "RGBA" and found.getpixel((0, 0)) == (9, 8, 7, 0)
+
+
+def test_shots_are_pictures_for_pillow_and_notebooks(scene: TrainedScene) -> None:
+    shot = scene.render(0)
+    assert np.array_equal(np.asarray(shot.image), shot.pixels)
+    assert shot._repr_png_().startswith(b"\x89PNG")
+
+
+def test_training_goes_on_where_it_was_stopped(world: World, tmp_path: Path) -> None:
+    told: list[Progressed] = []
+
+    def stop_soon(news: Progressed) -> None:
+        told.append(news)
+        if news.what == "training":
+            raise fprf.Stopped
+
+    # By steps: how much a wall-clock budget allows depends on the machine.
+    config = replace(world.config, steps=6, minutes=None)
+    with pytest.raises(fprf.Stopped), pytest.MonkeyPatch.context() as patched:
+        patched.setattr("fprf.training.driver.REPORT_SECONDS", 0.0)
+        fprf.train(world.town, "fprf-lite", output=tmp_path / "run", config=config, progress=stop_soon)
+    assert told and all(0 <= news.share <= 1 for news in told)
+    assert 0 < fprf.load(tmp_path / "run").trained.step < 6
+    heard: list[Progressed] = []
+    scene = fprf.train(
+        world.town, "fprf-lite", output=tmp_path / "run", config=config, progress=heard.append, device="cpu"
+    )
+    assert scene.trained.step == 6 and heard[-1].share == 1
+    # Files of others are not touched.
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "events.jsonl").write_text("mine")
+    with pytest.raises(UsageError, match="no run has written it"):
+        fprf.train(world.town, "fprf-lite", output=tmp_path / "other", config=config)
+    assert (tmp_path / "other" / "events.jsonl").read_text() == "mine"
+
+
+def test_process_is_that_of_the_command(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--output .*holds something else"):
+        (tmp_path / "full").mkdir()
+        (tmp_path / "full" / "letter.txt").write_text("")
+        fprf.process(tmp_path, tmp_path / "full")

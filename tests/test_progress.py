@@ -1,11 +1,13 @@
 import io
 import json
+import sys
+import types
 
 import pytest
 from rich.console import Console
 
 from fprf import progress
-from fprf.progress import Display, Report
+from fprf.progress import Display, Progressed, Report
 
 
 def report(step: int, share: float) -> Report:
@@ -49,3 +51,41 @@ def test_a_terminal_sees_a_bar_and_no_json(monkeypatch: pytest.MonkeyPatch) -> N
         and "rendering" in text
         and "{" not in text
     )
+
+
+def test_a_notebook_sees_one_bar_for_each_step(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown: list[str] = []
+
+    class Handle:
+        def update(self, text: str) -> None:
+            shown[-1] = text
+
+    def display(text: str, *, display_id: bool) -> Handle:
+        assert display_id
+        shown.append(text)
+        return Handle()
+
+    stand_in = types.ModuleType("IPython.display")
+    stand_in.HTML = str  # type: ignore[attr-defined]
+    stand_in.display = display  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "IPython.display", stand_in)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr(progress, "CELL_SECONDS", 0.0)
+    with Display() as bar:
+        bar.say("a town [of] 3")
+        bar.count(1, 2, "<features>")
+        bar.training(report(5, 0.25))
+        bar.training(report(7, 0.5))
+    out, err = capsys.readouterr()
+    assert len(shown) == 2 and "&lt;features&gt; 50%" in shown[0] and "step 7" in shown[1]
+    assert err == "a town [of] 3\n" and not out
+
+
+def test_a_listener_is_told_whatever_is_shown() -> None:
+    told: list[Progressed] = []
+    with Display(quiet=True, listener=told.append) as display:
+        display.count(1, 4, "features")
+        display.training(report(7, 0.5))
+    assert [(each.what, each.share) for each in told] == [("features", 0.25), ("training", 0.5)]

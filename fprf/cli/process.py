@@ -1,19 +1,12 @@
 """`fprf process IMAGES|VIDEO --output SCENE`: poses for images that have none, by COLMAP's Python package."""
 
 import shlex
-from dataclasses import asdict, dataclass, replace
-from importlib.util import find_spec
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from .. import __version__
-from ..errors import UsageError
 from ..progress import Display
 from ..reconstruction.config import SfmConfig
 from .parsing import parse
-
-if TYPE_CHECKING:
-    from ..reconstruction.scene_folder import SceneFolder, State
 
 MINUTES = 3
 """Minutes of the printed training command."""
@@ -40,19 +33,10 @@ def run(args: list[str]) -> int:
     config = parse(
         ProcessConfig(), args, prog="fprf process", description=_PROCESS_HELP, positional=("source",)
     )
-    if find_spec("pycolmap") is None:
-        raise UsageError(
-            "fprf process: pycolmap is not installed; install it with: pip install 'pycolmap>=4'"
-        )
-    config = replace(config, source=_source(config.source))
-    from ..io.folder_lock import lock_folder
-    from ..reconstruction.scene_folder import SceneFolder
+    from ..reconstruction.process import process
 
-    place = SceneFolder(
-        config.output if config.output is not None else Path("scenes") / config.source.resolve().stem
-    )
-    with lock_folder(place.root, "is finding poses here"), Display() as display:
-        content = _reconstruct(config, place, display)
+    with Display() as display:
+        root, content = process(config.source, config.output, config, display)
     images = content["images"]
     print(
         f"{images['posed']} of {images['given']} images have a pose; {content['points']} points, "
@@ -72,72 +56,9 @@ def run(args: list[str]) -> int:
                 count = f"{len(dropped)} images, for example "
             print(f"lost in {step}: {count}{drop['image']}: {drop['reason']}")
     if content["dropped"]:
-        print(f"all of them in {place.root / 'process.json'}")
-    _check(place.root)
+        print(f"all of them in {root / 'process.json'}")
+    _check(root)
     return 0
-
-
-def _source(given: Path) -> Path:
-    """The folder or video that is given; of a folder that holds a video and no images that video.
-
-    Raises UsageError where it holds several: a scene is made of one.
-    """
-    from ..datamanagers.images import IMAGE_SUFFIXES
-    from ..io.video_reader import VIDEO_SUFFIXES
-
-    if not given.is_dir():
-        return given
-    files = []
-    for path in sorted(given.iterdir()):
-        if path.is_file() and not path.name.startswith("."):
-            files.append(path)
-    videos = []
-    for path in files:
-        if path.suffix.lower() in VIDEO_SUFFIXES:
-            videos.append(path)
-    if not videos or any(path.suffix.lower() in IMAGE_SUFFIXES for path in given.rglob("*")):
-        return given
-    if len(videos) > 1:
-        names = ", or ".join(str(path) for path in videos[:3])
-        raise UsageError(f"{given}: {len(videos)} videos and no images; a scene is made of one: give {names}")
-    return videos[0]
-
-
-def _reconstruct(config: ProcessConfig, place: "SceneFolder", display: Display) -> dict[str, Any]:
-    """Take all steps, and write what came of every image to process.json. Returns its content."""
-    from ..io.atomic import write_json
-    from ..reconstruction.colmap import find_features, find_matches, find_poses
-    from ..reconstruction.images import gather_images, lost_files
-    from ..reconstruction.masks import gather_masks
-    from ..reconstruction.scene_folder import MatchTables, State, report
-
-    state = State.load(place)
-    models: list[dict[str, Any]] = []
-    matching: str = config.matching
-    gather_images(config.source, place, state, config, display.count)
-    gather_masks(config.masks, place, state)
-    for note in (lost_files(state), *_notes(state, "left out", "frames", "masks")):
-        if note:
-            display.say(note)
-    # Each step is skipped where `state` says that it was done for the same files and settings.
-    find_features(place, state, config, display.count)
-    matching = find_matches(place, state, config, display.count)
-    try:
-        models = find_poses(place, state, config, display.count)
-    finally:
-        content = report(asdict(state), matching, MatchTables(place.database), models, __version__)
-        write_json(place.root / "process.json", content)
-    for note in _notes(state, "lenses"):
-        display.say(note)
-    return content
-
-
-def _notes(state: "State", *steps: str) -> list[str]:
-    """Decisions that some steps have made."""
-    notes = []
-    for step in steps:
-        notes += state.notes.get(step, [])
-    return notes
 
 
 def _check(root: Path) -> None:

@@ -1,15 +1,14 @@
 """`fprf train [METHOD|CONFIG.json]`: train a scene, or go on where a run stopped."""
 
-import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import PluginError, UsageError
+from ..errors import PluginError
 from ..io.paths import as_path
 from ..plugins import registry
 from .parsing import first_line, load_method, parse, read_paths
@@ -21,19 +20,6 @@ DEFAULT_METHOD = "fprf-splats"
 VIEW = "--view"
 CHANGED = "--changed-images"
 OVERWRITE = "--overwrite"
-_RUN_FILES = (
-    "config.json",
-    "scene.json",
-    "images.json",
-    "basis.safetensors",
-    "style.safetensors",
-    "events.jsonl",
-    "checkpoints",
-    "blocks",
-    "cells",
-    "overview",
-)
-"""What training writes into a run folder (docs/design.md)."""
 
 
 def run(args: list[str]) -> int:
@@ -58,8 +44,9 @@ def run(args: list[str]) -> int:
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
     from ..training.driver import default_output, train
+    from ..training.run import make_room
 
-    _make_room(config.output or default_output(config, method), read_paths(config), overwrite)
+    make_room(config.output or default_output(config, method), read_paths(config), overwrite)
     if VIEW not in args:
         train(config, method, changed_images=changed)
         return 0
@@ -86,41 +73,6 @@ def _take_overwrite(args: list[str]) -> tuple[list[str], bool]:
             rest.append(arg)
             after = False
     return rest, overwrite
-
-
-def _make_room(run: Path, reads: Sequence[Path], overwrite: bool) -> None:
-    """Remove the run that is to be overwritten; nothing that the new one reads.
-
-    Raises UsageError where files lie in the place of a run's that no run has written, unless they may be
-    overwritten. Whether a run that is there goes on, training itself says.
-    """
-    from ..training.locks import lock_folder
-    from ..training.run import Run
-
-    there = []
-    for name in _RUN_FILES:
-        if (run / name).exists():
-            there.append(run / name)
-    if not there or (Run(run).exists and not overwrite):
-        return
-    if not overwrite:
-        raise UsageError(
-            f"{there[0]}: is there already, and no run has written it; name another --output, or replace it with "
-            f"{OVERWRITE} true"
-        )
-    for path in there:
-        for read in reads:
-            if read.exists() and read.resolve().is_relative_to(path.resolve()):
-                raise UsageError(
-                    f"{read}: is read, and lies in what is to be overwritten; name another --output"
-                )
-    with lock_folder(run):
-        ours = (run / "scene.json").is_file() and Run(run).exists
-        for path in there:
-            if path.is_file():
-                path.unlink()
-            elif ours:
-                shutil.rmtree(path)
 
 
 @contextmanager

@@ -24,13 +24,13 @@ from typing import Any, NamedTuple
 from ..datamanagers.images import useless_masks
 from ..datamanagers.parsers.config import recognise
 from ..datamanagers.scene import ParsedScene
-from ..errors import CheckpointError, DataError, NumericsError, UsageError
+from ..errors import CheckpointError, DataError, NumericsError, Stopped, UsageError
 from ..interfaces import Figures, Learner
 from ..io.atomic import remove_unfinished
 from ..memory import out_of_memory, shortage
 from ..plugins.codec import leaves
 from ..plugins.config import Need
-from ..progress import LINE_SECONDS, Display, Report
+from ..progress import LINE_SECONDS, Display, Listener, Report
 from ..run_config import RunConfig
 from ..scenes import Partition
 from . import checkpoint
@@ -88,11 +88,19 @@ def schedule_of(config: RunConfig, views: int) -> Schedule:
     return Schedule(config.limited(views), config.minutes, config.checkpoint_minutes)
 
 
-def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images: bool = False) -> Path:
+def train(
+    config: RunConfig,
+    method: str,
+    *,
+    quiet: bool = False,
+    changed_images: bool = False,
+    listener: Listener | None = None,
+) -> Path:
     """Train a scene to the end and return its run folder; an existing run there is resumed if its config and
     images fit.
 
-    With `changed_images` they may be others than those that the run was begun with. Raises UsageError where
+    With `changed_images` they may be others than those that the run was begun with. `listener` is told of the
+    progress, and stops the training by raising Stopped. Raises UsageError where
     packages, weights or the scene are missing, DataError where another process is training there.
     """
     output = config.output or default_output(config, method)
@@ -103,7 +111,7 @@ def train(config: RunConfig, method: str, *, quiet: bool = False, changed_images
         _check_needs(config, method, display)
         config.compile_kernels(device_of(config.reading.device), display.say)
     start = time.perf_counter()  # of the minutes
-    with lock_folder(output), Display(quiet=quiet) as display:
+    with lock_folder(output), Display(quiet=quiet, listener=listener) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         # An existing run goes on with its own config and images; what was cut short there is removed.
         config = _going_on(run, config)
@@ -170,7 +178,7 @@ def learn(
 
     Returns how many steps are made, and the seconds of training, those of earlier starts included.
 
-    Without a `run` nothing is saved. An interrupt saves first, then goes on upwards. Steps that are not
+    Without a `run` nothing is saved. An interrupt, or Stopped, saves first, then goes on upwards. Steps that are not
     finite change nothing and are logged; PATIENCE of them in a row lead back to the last checkpoint: on CUDA
     with the next report. Raises NumericsError where there is none, or where that was of no use,
     OutOfMemoryError where a step finds too little memory.
@@ -246,7 +254,7 @@ def learn(
                     save()
             if signals.asked:
                 raise KeyboardInterrupt
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Stopped):
             if not signals.hurried:  # else a step was cut in half
                 save()
             raise

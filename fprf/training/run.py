@@ -15,6 +15,7 @@ render.
 
 import json
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,9 +36,23 @@ from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
 from ..run_config import RunConfig
 from .facts import Facts, facts_from_json, facts_to_json
+from .locks import lock_folder
 
 FORMAT = 1
 """Version of scene.json."""
+_RUN_FILES = (
+    "config.json",
+    "scene.json",
+    "images.json",
+    "basis.safetensors",
+    "style.safetensors",
+    "events.jsonl",
+    "checkpoints",
+    "blocks",
+    "cells",
+    "overview",
+)
+"""What training writes into a run folder (docs/design.md)."""
 _MAX_SOME = 8
 """Views of the split `some`, at most."""
 _CAMERA = {"pose": (3, 4), "focal": (2,), "centre": (2,), "size": (2,), "distortion": (6,), "lens": ()}
@@ -239,3 +254,35 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+
+def make_room(run: Path, reads: Sequence[Path], overwrite: bool) -> None:
+    """Remove the run that is to be overwritten; nothing that the new one reads.
+
+    Raises UsageError where files lie in the place of a run's that no run has written, unless they may be
+    overwritten. Whether a run that is there goes on, training itself says.
+    """
+    there = []
+    for name in _RUN_FILES:
+        if (run / name).exists():
+            there.append(run / name)
+    if not there or (Run(run).exists and not overwrite):
+        return
+    if not overwrite:
+        raise UsageError(
+            f"{there[0]}: is there already, and no run has written it; name another --output, or replace it with "
+            "--overwrite true"
+        )
+    for path in there:
+        for read in reads:
+            if read.exists() and read.resolve().is_relative_to(path.resolve()):
+                raise UsageError(
+                    f"{read}: is read, and lies in what is to be overwritten; name another --output"
+                )
+    with lock_folder(run):
+        ours = (run / "scene.json").is_file() and Run(run).exists
+        for path in there:
+            if path.is_file():
+                path.unlink()
+            elif ours:
+                shutil.rmtree(path)

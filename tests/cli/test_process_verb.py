@@ -221,7 +221,7 @@ def test_a_missing_or_an_old_pycolmap_is_refused(
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert process(photos) == 2
     assert "pycolmap 4 or newer is needed" in capsys.readouterr().err
-    monkeypatch.setattr("fprf.cli.process.find_spec", lambda name: None)
+    monkeypatch.setattr("fprf.reconstruction.process.find_spec", lambda name: None)
     assert process(photos) == 2
     assert "pip install 'pycolmap" in capsys.readouterr().err
 
