@@ -218,7 +218,7 @@ def test_training_goes_on_where_it_was_stopped(world: World, tmp_path: Path) -> 
 
 
 def test_process_is_that_of_the_command(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--output .*holds something else"):
+    with pytest.raises(UsageError, match=r"--output .*holds something else"):
         (tmp_path / "full").mkdir()
         (tmp_path / "full" / "letter.txt").write_text("")
         fprf.process(tmp_path, tmp_path / "full")

@@ -16,6 +16,7 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ import pytest
 from splat_ball import ball
 from tiny_world import World, flags
 
+import fprf
 from fprf.cli import main as cli
 from fprf.cli.main import VERBS
 from fprf.io.atomic import write_json
@@ -265,6 +267,9 @@ def test_the_page_runs(
     for name, reference in zip(("autumn.jpg", "night.jpg"), world.references, strict=True):
         cv2.imwrite(name, cv2.imread(str(reference)))
     write_gaussians(Path("scan.ply"), ball(200))
+    # Minutes long; tests/test_api.py runs both small. Here their arguments are looked at.
+    for name, result in (("process", world.town), ("train", fprf.load(world.run))):
+        monkeypatch.setattr(fprf, name, create_autospec(getattr(fprf, name), return_value=result))
     names: dict[str, object] = {}
     for block in re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE):
         exec(compile(block, str(PAGE), "exec"), names)
