@@ -51,7 +51,7 @@ VERBS = {
     "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
     "export": Verb("RUN [ply splat glb cameras]", "points, splats, meshes, cameras as files"),
     "pretrain": Verb("decoder", "train the decoder of an encoder"),
-    "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
+    "plugins": Verb("[--check | new NAME]", "list what is installed, check that it loads, begin another"),
     "doctor": Verb("[DIR|METHOD]", "look over this machine, a scene or a method's needs"),
 }
 

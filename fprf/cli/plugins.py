@@ -1,5 +1,5 @@
 """`fprf plugins`: what is installed, from metadata alone; `--check` imports each and says what is wrong with
-it.
+it; `new` writes a package with another.
 """
 
 from collections.abc import Iterator
@@ -24,6 +24,7 @@ from ..plugins.executors.config import ExecutorConfig
 from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
+from . import new_plugin
 from .config import CommandConfig
 from .parsing import load_method, parse
 
@@ -65,8 +66,13 @@ class PluginsConfig:
 
 
 def run(args: list[str]) -> int:
-    """List, and with `--check` load, every installed plug-in."""
-    config = parse(PluginsConfig(), args, prog="fprf plugins", description="List the installed plug-ins.")
+    """List, and with `--check` load, every installed plug-in; `new` writes one."""
+    if args[:1] == ["new"]:
+        return new_plugin.run(args[1:])
+    about = (
+        "List the installed plug-ins. `fprf plugins new NAME --kind KIND` writes a package with a new one."
+    )
+    config = parse(PluginsConfig(), args, prog="fprf plugins", description=about)
     # Listing reads metadata alone; --check imports everything.
     checked = dict(faults()) if config.check else {}
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))

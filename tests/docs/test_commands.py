@@ -48,8 +48,8 @@ PARSED = {
 }
 """Verbs whose commands are parsed whole, with the files that they name."""
 ELSEWHERE = {
-    "gabor": "the encoder of examples/plugin: tests/test_example_plugin.py installs and runs it",
-    "opacity": "the loss of examples/plugin, likewise",
+    "contrast": "an encoder that `fprf plugins new` writes: tests/test_example_plugin.py installs and runs it",
+    "opacity": "a loss, likewise",
     "--tone": "needs a run whose photographs differ in exposure: tests/training/test_camera_optimizers.py",
 }
 """Commands with these words, and where they are tested instead."""
