@@ -15,7 +15,7 @@ from fprf.cli.main import VERBS
 
 ROOT = Path(fprf.__file__).parent
 ORDER = (
-    *("version", "errors", "types", "memory", "checks", "progress", "io", "interfaces", "scenes", "configs"),
+    *("errors", "version", "types", "memory", "checks", "progress", "io", "interfaces", "scenes", "configs"),
     "outputs",
     *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
