@@ -1,11 +1,11 @@
 """Images or a video to a scene folder with camera poses: all steps, one after the other."""
 
 from dataclasses import asdict
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from .. import __version__
 from ..datamanagers.images import IMAGE_SUFFIXES
 from ..errors import UsageError
 from ..io.atomic import write_json
@@ -75,7 +75,7 @@ def _reconstruct(source: Path, config: SfmConfig, place: SceneFolder, display: D
     try:
         models = find_poses(place, state, config, display.count)
     finally:
-        content = report(asdict(state), matching, MatchTables(place.database), models, __version__)
+        content = report(asdict(state), matching, MatchTables(place.database), models, version("fprf"))
         write_json(place.root / "process.json", content)
     for note in _notes(state, "lenses"):
         display.say(note)
