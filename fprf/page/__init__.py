@@ -12,6 +12,7 @@
 - Its styles, and what they show, drawn step by step: `drawing.py`, in the thread of `render_worker.py`.
 """
 
+import base64
 from importlib.resources import files
 from pathlib import Path
 
@@ -24,6 +25,13 @@ EXAMPLES = {path.name: path for path in sorted((GARDEN / "references").glob("*.j
 def read_asset(name: str) -> str:
     """A text that browsers get: a file of `web/`."""
     return (files(__package__) / "web" / name).read_text("utf-8")
+
+
+def css(*more: str) -> str:
+    """The styles of every page with their typeface, and `more`, one after the other."""
+    font = base64.b64encode((files(__package__) / "web" / "fonts" / "figtree.woff2").read_bytes()).decode()
+    face = f'@font-face {{ font-family: Figtree; font-weight: 300 900; src: url("data:font/woff2;base64,{font}"); }}'
+    return "\n".join([face, *map(read_asset, ("page.css", *more))])
 
 
 def script(*more: str) -> str:

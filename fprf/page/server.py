@@ -34,7 +34,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
-from . import EXAMPLES, read_asset, script
+from . import EXAMPLES, css, read_asset, script
 from .messages import StartRequest, read_message
 from .start import Start
 
@@ -67,7 +67,7 @@ _SENT_BYTES = 1 << 16
 _LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
 """Scripts of the served page, beside those of every page."""
 _POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src data:; connect-src 'self'; "
     "worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _HEADERS = {
@@ -410,12 +410,12 @@ class ViewerServer:
         # The stage of any page, with the panel of the served one.
         examples = "\n".join(_example(name) for name in EXAMPLES)
         panel = Template(read_asset("panel.html")).substitute(examples=examples)
-        stage = Template(read_asset("stage.html")).substitute(still="hidden", ratio="", facts=panel)
+        stage = Template(read_asset("stage.html")).substitute(still="hidden", panel=panel)
         page = Template(read_asset("live.html")).substitute(stage=stage, examples=examples)
         return [
             Route("/", _asset("text/html", lambda: page)),
             Route("/app.js", _asset("text/javascript", lambda: script(*_LIVE_SCRIPTS) + "\nlive();\n")),
-            Route("/app.css", _asset("text/css", lambda: read_asset("page.css") + read_asset("live.css"))),
+            Route("/app.css", _asset("text/css", lambda: css("live.css"))),
             WebSocketRoute("/live", self._live),
             Route("/scene", self._scene),
             Route("/colours", self._colours),

@@ -13,6 +13,7 @@ from pathlib import Path
 from string import Template
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +27,7 @@ from ..scenes import Scene
 from ..splats.pinholes import camera_of
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
-from . import read_asset, script
+from . import css, read_asset, script
 from .pack import Packed, colour_header, colour_section, header, pack, sections
 
 CAPTURED = "Captured"
@@ -36,6 +37,8 @@ _VIEW_PIXELS = 512
 """Longest side of a view below it; by eye."""
 _MATCH_MAP_PIXELS = 320
 """Longest side of a match map; by eye."""
+_THUMBNAIL_PIXELS = 96
+"""Longest side of a reference beside its style: twice as many as it takes there."""
 REFERENCE_PIXELS = 320
 """Longest side of references: as match maps, which lie beside them."""
 _MAX_PAGE_CAMERAS = 48
@@ -267,13 +270,17 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     stills = []
     for row in pictures:
         stills.append([data_uri(shrink(each, _STAGE_PIXELS)) for each in row[:most]])
+    made_of = [[], *(list(style.references) for style in page.styles)]
     heads = [{}] * len(names) if head is None else head["styles"]
     data = {
         "scene": None if head is None else {key: value for key, value in head.items() if key != "styles"},
-        "styles": [{"name": name, **about_colours} for name, about_colours in zip(names, heads, strict=True)],
+        "styles": [
+            {"name": name, "of": of, **about_colours}
+            for name, of, about_colours in zip(names, made_of, heads, strict=True)
+        ],
+        "references": {each.name: data_uri(_thumbnail(each.image)) for each in page.references},
         "stills": dict(zip(names, stills, strict=True)),
     }
-    height, width = page.views[0].original.shape[:2]
     known = {}
     for reference in page.references:
         known[reference.name] = reference
@@ -300,14 +307,14 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
-        css=read_asset("page.css"),
+        css=css(),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present),
         stage=Template(read_asset("stage.html")).substitute(
             still=f'src="{stills[0][0]}"',
-            ratio=f'style="--ratio:{width / height:.4f}"',
-            facts=f'<dl class="facts">{rows}</dl>' if rows else "",
+            panel="",
         ),
+        facts=f'<dl class="facts">{rows}</dl>' if rows else "",
         body="\n".join(body),
         credits="\n".join(f"<p>{escape(line)}</p>" for line in page.credits),
         # "<" cannot end the script then, whatever a name holds.
@@ -315,6 +322,14 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
         sections="\n".join(scripts),
         script=code,
     )
+
+
+def _thumbnail(picture: Picture) -> Picture:
+    """A reference as small as it is beside a style."""
+    if picture.shape[2] == 4:  # over white
+        alpha = picture[..., 3:].astype(np.float32) / 255
+        picture = (picture[..., :3] * alpha + 255 * (1 - alpha)).round().astype(np.uint8)
+    return shrink(picture, _THUMBNAIL_PIXELS)
 
 
 def _img(picture: Picture, side: int, alt: str) -> str:

@@ -39,6 +39,9 @@ class Pictures {
   }
 }
 
+const MOST_SHOWN = 4; // photographs beside a style that is of several; by eye
+const SWEEP_MS = 4200; // that the line takes on its way across, once; by eye
+
 // The controls of a stage: which style, from which other one, how far, or a line between both.
 class Stage {
   constructor(place, styles) {
@@ -67,11 +70,13 @@ class Stage {
     styles.forEach((style) => this.add(style));
   }
 
-  // `style` has a name and, where there is one, a small picture.
+  // `style` has a name and, where there are any, a small picture of the scene in it (`thumb`) and of its photographs (`of`).
   add(style) {
     if (this.styles.some((each) => each.name === style.name)) return;
+    const picture = (src) => make("img", { src, alt: "", draggable: false });
     const card = make("button", { type: "button", className: "look", title: style.name, onclick: () => this.choose(style.name) },
-      ...(style.thumb ? [make("img", { src: style.thumb, alt: "", draggable: false })] : []), make("span", { textContent: style.name }));
+      ...(style.thumb ? [picture(style.thumb)] : []), make("span", { className: "name", textContent: style.name }),
+      ...(style.of?.length ? [make("span", { className: "of" }, ...style.of.slice(0, MOST_SHOWN).map(picture))] : []));
     this.styles.push({ ...style, card });
     at("looks").insertBefore(card, at("add"));
     at("from").append(make("option", { value: style.name, textContent: style.name }));
@@ -92,6 +97,25 @@ class Stage {
       if (t < 1) requestAnimationFrame(step);
       else this.set({});
     };
+    requestAnimationFrame(step);
+  }
+
+  // Begin in a style: the line draws it from the right across the scene and comes to rest in the middle, unless motion is
+  // not wanted or somebody takes over.
+  begin(name) {
+    this.set({ to: name, wiping: true, line: 0.5 });
+    if (!(this.place instanceof Place) || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+    const controller = new AbortController(), stop = () => controller.abort();
+    for (const kind of ["pointerdown", "keydown", "wheel"]) addEventListener(kind, stop, { signal: controller.signal, capture: true });
+    const start = performance.now(), eased = (t) => t * t * (3 - 2 * t);
+    const step = (now) => {
+      if (controller.signal.aborted) return;
+      const t = Math.min(1, (now - start) / SWEEP_MS);
+      this.set({ line: t < 0.7 ? 1 - 0.94 * eased(t / 0.7) : 0.06 + 0.44 * eased((t - 0.7) / 0.3) });
+      if (t < 1) requestAnimationFrame(step);
+      else stop();
+    };
+    this.set({ line: 1 });
     requestAnimationFrame(step);
   }
 
@@ -135,7 +159,7 @@ class Stage {
 
 // A page of one file: everything lies in it.
 const open = async (data) => {
-  const styles = data.styles.map(({ name }) => ({ name, thumb: data.stills[name][0] })), root = at("place");
+  const styles = data.styles.map(({ name, of }) => ({ name, thumb: data.stills[name][0], of: of.map((each) => data.references[each]) })), root = at("place");
   const fall = (why) => {
     root.classList.add("pictures");
     root.dataset.why = why;
@@ -176,6 +200,7 @@ const open = async (data) => {
       await new Promise((done) => setTimeout(done, 0)); // a picture between two styles
     }
     stage.add(styles[k]);
+    if (k === 1) stage.begin(styles[k].name);
   }
   root.classList.add("ready");
 };
