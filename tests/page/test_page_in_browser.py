@@ -41,8 +41,10 @@ def browser() -> Iterator[Any]:
         yield found
 
 
-def opened(browser: Any, path: Path, width: int = 640, height: int = 480, script: str = "") -> Any:
-    page = browser.new_page(viewport={"width": width, "height": height})
+def opened(
+    browser: Any, path: Path, width: int = 640, height: int = 480, script: str = "", motion: str = "reduce"
+) -> Any:
+    page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion=motion)
     page.errors = []
     page.on("pageerror", lambda error: page.errors.append(str(error)))
     page.on("console", lambda line: page.errors.append(line.text) if line.type == "error" else None)
@@ -105,6 +107,7 @@ def test_it_draws_what_the_rasteriser_draws(browser: Any, tmp_path: Path, kind: 
 @pytest.fixture
 def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
     found = opened(browser, written(tmp_path / "page.html", seen(ball(2000, 1))))
+    found.keyboard.press("0")
     yield found
     assert found.errors == []
     found.close()
@@ -139,7 +142,7 @@ def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
     page.wait_for_function("() => !fprf.place.flight")
     assert np.allclose(start, page.evaluate(POSE), atol=1e-3)
     page.keyboard.press("1")
-    assert page.locator(".look[aria-pressed=true]").inner_text() == "dusk"
+    assert page.locator(".look[aria-pressed=true]").get_attribute("title") == "dusk"
     page.wait_for_function("() => fprf.place.blend === 1 && fprf.place.second === 'dusk'")
     dusk = pixels(page)
     assert np.abs(dusk - plain).mean() > 0.02
@@ -150,11 +153,10 @@ def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
     page.locator("#wiping").click()
     wiped = pixels(page)
     third = wiped.shape[1] // 3
-    # Labels and the line lie over the picture.
-    assert (
-        np.abs(wiped[80:, :third] - plain[80:, :third]).mean() < 0.02
-        and np.abs(wiped[80:, -third:] - dusk[80:, -third:]).mean() < 0.02
-    )
+    # Controls lie over the picture above and below.
+    middle_rows = slice(80, -180)
+    assert np.abs(wiped[middle_rows, :third] - plain[middle_rows, :third]).mean() < 0.02
+    assert np.abs(wiped[middle_rows, -third:] - dusk[middle_rows, -third:]).mean() < 0.02
 
 
 def test_the_whole_page_works_by_keyboard(page: Any) -> None:
@@ -251,8 +253,49 @@ def test_without_webgl_or_room_for_all_gaussians_there_are_pictures(
     assert why in page.evaluate("() => document.querySelector('.place').dataset.why")
     page.locator(".look", has_text="dusk").click()
     assert page.locator(".still.two").is_visible() and not page.locator("#canvas").is_visible()
-    page.locator("#wiping").click()
     assert (
         page.evaluate("() => document.querySelector('.still.two').style.clipPath") == "inset(0px 0px 0px 50%)"
     )
     assert page.errors == []
+
+
+def test_a_page_opens_in_a_style_that_the_line_draws_once(browser: Any, tmp_path: Path) -> None:
+    path = written(tmp_path / "page.html", seen(ball(500)))
+    page = opened(browser, path, motion="no-preference")
+    lines = []
+    for _ in range(200):
+        lines.append(page.evaluate("() => fprf.stage.line"))
+        if len(lines) > 3 and lines[-1] == 0.5:
+            break
+        page.wait_for_timeout(50)
+    assert max(lines) > 0.8 and min(lines) < 0.3 and lines[-1] == 0.5
+    assert page.evaluate("() => [fprf.stage.to, fprf.stage.wiping]") == ["dusk", True]
+    still = opened(browser, path)
+    assert still.evaluate("() => [fprf.stage.to, fprf.stage.wiping, fprf.stage.line]") == ["dusk", True, 0.5]
+    assert page.errors == still.errors == []
+
+
+def test_who_touches_the_page_while_the_line_moves_keeps_it_where_it_is(browser: Any, tmp_path: Path) -> None:
+    page = opened(browser, written(tmp_path / "page.html", seen(ball(500))), motion="no-preference")
+    page.keyboard.press("2")
+    page.wait_for_timeout(200)
+    line = page.evaluate("() => fprf.stage.line")
+    page.wait_for_timeout(500)
+    assert page.evaluate("() => [fprf.stage.to, fprf.stage.line]") == ["plain", line]
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (2560, 1440), (400, 800)])
+@pytest.mark.parametrize("format_", [(96, 72), (60, 108)])
+def test_the_stage_fills_the_first_screen_whatever_the_format(
+    browser: Any, tmp_path: Path, size: tuple[int, int], format_: tuple[int, int]
+) -> None:
+    scene = seen(ball(300))
+    views = scene.views.resized(torch.tensor([format_]).expand(len(scene.views), 2))
+    page = opened(browser, written(tmp_path / "page.html", replace(scene, views=views)), *size)
+    box = page.locator("#canvas").bounding_box()
+    assert box["width"] >= 0.6 * size[0] and box["height"] >= size[1] - 1 and box["y"] == 0
+    assert not page.locator(".facts").is_visible(), "facts are folded"
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= size[0]
+    picture = page.locator(".look > img").first.bounding_box()
+    assert picture["width"] == 96
+    assert page.locator(".look .of img").count() == 1, "the photograph beside the style that has one"

@@ -86,7 +86,7 @@ class Stage {
   // From the captured colours to a style, without a jump.
   choose(name) {
     const before = this.to;
-    this.set({ to: name, amount: 1 });
+    this.set({ to: name, amount: 1, wiping: this.wiping && name !== this.from });
     this.listeners.chosen?.(name);
     if (this.wiping || before === name || !(this.place instanceof Place) || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
     const start = performance.now();
