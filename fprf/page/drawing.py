@@ -31,18 +31,18 @@ from ..rendering.cameras import Cameras, ideal_cameras
 from ..rendering.paths import interpolate, read_camera_path, write_camera_path
 from ..scenes import Scene, SceneView
 from ..splats.scene import SplatScene
-from ..style.config import labels
+from ..style.config import find_reference, labels, parse_place, parse_region_value
 from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph
 from ..style.files import StyleFile, read_keyframes, write_style
 from ..style.look import Restyle
 from ..style.matching import unit
-from ..style.regions import memberships
+from ..style.regions import Regions, find_regions, memberships
 from ..style.restyle import Styled, apply_dictionary, keyed_looks
 from ..style.scene_style import RegionWeight, SceneStyle
-from .messages import Camera, ViewRequest
+from .messages import Camera, Film, ViewRequest
 from .pack import Colours, Packed
 from .render_worker import Steps
-from .state import Look, PageKeyframe, Photograph, RegionInfo, Shown
+from .state import Look, PageKeyframe, Photograph, RegionAction, RegionInfo, RegionRule, Shown
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -331,6 +331,46 @@ class ScenePainter:
         ).view_as(view.rgb)
 
 
+def picture_of(scene: Scene, cameras: Cameras, look: Restyle | None, wipe: float) -> Steps[Picture]:
+    """Render the first view in a look, and left of `wipe`, a share of its width, as captured; a step each strip."""
+    rows = []
+    border = round(max(0.0, wipe) * int(cameras.size[0, 0]))
+    for strip in _strips(scene, cameras):
+        shown = strip.restyled(look).rgb
+        if border:
+            shown = torch.cat([strip.restyled().rgb[:, :border], shown[:, border:]], 1)
+        rows.append(shown)
+        yield
+    return to_uint8(torch.cat(rows))
+
+
+def rules_of(restyler: Restyler, file: StyleFile, photographs: Sequence[Photograph]) -> frozenset[RegionRule]:
+    """The rules of a style file on the scene of a restyler; `photographs` are its references. Regions that the
+    scene does not have are left out. Raises UsageError for what names nothing.
+    """
+    style = file.style
+    encoders = restyler.encoders
+    regions = Regions(
+        restyler.scene, encoders.scene_style, encoders.basis, file.regions, file.semantic_encoder
+    )
+    rules = set()
+    actions: tuple[tuple[RegionAction, tuple[str, ...]], ...] = (("pin", style.pin), ("forbid", style.forbid))
+    for action, texts in actions:
+        for text in texts:
+            region, named = parse_region_value(action, text)
+            if parse_place(action, region) is not None:
+                raise UsageError(
+                    f"{text}: the page has rules for regions, not for places; use `fprf restyle`"
+                )
+            photograph = photographs[find_reference(named, style.references)]
+            for match in find_regions(regions, region):
+                rules.add(RegionRule(match.number, action, photograph))
+    for text in style.keep:
+        for match in find_regions(regions, text):
+            rules.add(RegionRule(match.number, "keep", None))
+    return frozenset(rules)
+
+
 def _strips(scene: Scene, cameras: Cameras) -> Iterator[SceneView]:
     """The first view in strips of some rows each, from the top."""
     width, height = cameras.size[0].tolist()
@@ -374,73 +414,82 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
     return replace(ideal_cameras(torch.stack(poses), 1.0, size), focal=focals, centre=centres)
 
 
-FPS = 24.0
-"""Frames a second of a film."""
-FILM_SIDE = 960
-"""Longest side of a film in pixels; by eye."""
 _MAX_FILM_SECONDS = 600.0
 """Length of a film that is made from the page, at most: `fprf render` makes longer ones."""
 
 
-def film_gap(seconds: float) -> int:
-    """Frames from one key to the next, which are so many seconds apart."""
-    return max(1, round(seconds * FPS))
+def film_gap(film: Film) -> int:
+    """Frames from one key to the next."""
+    return max(1, round(film.seconds * film.fps))
 
 
-def film_cameras(keys: Sequence[PageKeyframe], seconds: float, side: int = FILM_SIDE) -> Cameras:
+def film_cameras(keys: Sequence[PageKeyframe], film: Film) -> Cameras:
     """A camera each frame, of even sizes in the shape of the first key's canvas; a single key is one frame.
 
     Raises UsageError for no keys or a film that is too long.
     """
     if not keys:
         raise UsageError("film: no keys yet; go somewhere and add one")
-    length = seconds * (len(keys) - 1)
+    length = film.seconds * (len(keys) - 1)
     if length > _MAX_FILM_SECONDS:
         raise UsageError(f"film: {length:.0f} s; at most {_MAX_FILM_SECONDS:.0f} s are filmed from the page")
     width, height = keys[0].camera.size
-    by = side / max(width, height) / 2
+    by = film.side / max(width, height) / 2
     size = (max(2, 2 * round(width * by)), max(2, 2 * round(height * by)))
     cameras = cameras_of([key.camera for key in keys], size)
-    return interpolate(cameras, torch.arange(len(keys)), film_gap(seconds) - 1)
+    return interpolate(cameras, torch.arange(len(keys)), film_gap(film) - 1)
 
 
-def write_film_files(
-    folder: Path, keys: Sequence[PageKeyframe], seconds: float, scene: Scene, side: int = FILM_SIDE
-) -> None:
+def write_film_files(folder: Path, keys: Sequence[PageKeyframe], film: Film, scene: Scene) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs; the folder is
     made.
 
     The path is in the capture's coordinates.
     """
-    cameras = film_cameras(keys, seconds, side)  # refused before there is a folder
+    cameras = film_cameras(keys, film)  # refused before there is a folder
     folder.mkdir(parents=True, exist_ok=True)
-    write_camera_path(folder / "path.json", cameras, FPS, scene.origin)
+    write_camera_path(folder / "path.json", cameras, film.fps, scene.origin)
     # Keys with equal looks share a style, so that nothing is restyled between them.
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(keys):
         if not key.look.plain and key.look not in looks:
             path = folder / f"style-{len(looks) + 1}" / "style.json"
-            path.parent.mkdir()
-            # Copies of the photographs, for uploads go with the viewer; the style names them beside itself.
-            references = []
-            for k, (photograph, _) in enumerate(key.look.mix):
-                stem = photograph.name.rsplit(".", 1)[0]
-                plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)
-                references.append(path.with_name(f"{k + 1}-{plain or 'photograph'}.png"))
-                shutil.copyfile(photograph.path, references[-1])
-            style_of_look = replace(key.look.config(), references=tuple(references))
-            write_style(path, StyleFile(style_of_look, {}, scene.semantic_encoder))
+            write_style_of(path, key.look, StyleFile(key.look.config(), {}, scene.semantic_encoder))
             looks[key.look] = path
         # A key without a look is the scene as captured.
         style = looks.get(key.look)
         rows.append(
             {
-                "frame": i * film_gap(seconds),
+                "frame": i * film_gap(film),
                 "style": None if style is None else str(style.relative_to(folder)),
             }
         )
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
+
+
+def write_style_of(path: Path, look: Look, file: StyleFile) -> None:
+    """Write a look as a style.json at `path`, whose folder is made, with copies of its photographs beside it:
+    uploads go with the viewer.
+    """
+    path.parent.mkdir(parents=True)
+    references = []
+    for k, (photograph, _) in enumerate(look.mix):
+        stem = photograph.name.rsplit(".", 1)[0]
+        plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)
+        references.append(path.with_name(f"{k + 1}-{plain or 'photograph'}.png"))
+        shutil.copyfile(photograph.path, references[-1])
+    # References by their number: those of uploads have names of their own.
+    style = file.style
+    rules = {}
+    for field, texts in (("pin", style.pin), ("forbid", style.forbid)):
+        numbered = []
+        for text in texts:
+            region, named = parse_region_value(field, text)
+            numbered.append(f"{region}={find_reference(named, style.references)}")
+        rules[field] = tuple(numbered)
+    style = replace(style, references=tuple(references), pin=rules["pin"], forbid=rules["forbid"])
+    write_style(path, file._replace(style=style))
 
 
 def film_frames(folder: Path, scene: Scene) -> list[Steps[Picture]]:

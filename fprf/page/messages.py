@@ -97,7 +97,15 @@ class Keep(Message, tag="keep"):
     """A look is kept under a name, or taken up again."""
 
     name: Text
-    action: Literal["keep", "restore"]
+    action: Literal["keep", "restore", "remove"]
+    replace: bool = False
+    """Take the place of another look that has this name."""
+
+
+class Undo(Message, tag="undo"):
+    """What was made last is undone, or done again."""
+
+    again: bool = False
 
 
 class Key(Message, tag="key"):
@@ -106,17 +114,35 @@ class Key(Message, tag="key"):
     action: Literal["add", "earlier", "remove"]
     at: Count = 0
     camera: Camera | None = None
+    shown: Text = "Now"
+    """Name of the look that the client sees: what is kept is what is shown."""
 
 
 class Film(Message, tag="film"):
     """The film is to be made."""
 
     seconds: Annotated[float, Meta(ge=0.1, le=60)] = 2.0
+    """From each key to the next."""
+    side: Annotated[int, Meta(ge=16, le=3840)] = 960
+    """Longest side in pixels."""
+    fps: Annotated[float, Meta(ge=1, le=60)] = 24.0
+    """Frames a second."""
+
+
+class PictureRequest(Message, tag="picture"):
+    """A picture of a scene that is drawn here, to be saved."""
+
+    camera: Camera
+    side: Annotated[int, Meta(ge=64, le=4096)]
+    """Longest side in pixels."""
+    shown: Text = "Now"
+    wipe: Annotated[float, Meta(ge=-1, le=1)] = -1.0
+    """Share of the width, from the left, that is shown as captured; below 0 none."""
 
 
 Change: TypeAlias = Set | Preset | Card | Region | Map | Keep | Key
 """Messages that change what all clients see."""
-AnyMessage: TypeAlias = ViewRequest | Pick | Film | Change
+AnyMessage: TypeAlias = ViewRequest | Pick | Film | Undo | Change
 
 Minutes: TypeAlias = Annotated[float, Meta(ge=0.05, le=600)]
 
@@ -150,7 +176,8 @@ class Leave(Message, tag="leave"):
 
 
 StartRequest: TypeAlias = New | Make | Open | Stop | Leave
-_decoders: dict[Any, Any] = {kinds: msgspec.json.Decoder(kinds) for kinds in (AnyMessage, StartRequest)}
+_KINDS: tuple[Any, ...] = (AnyMessage, StartRequest, PictureRequest)
+_decoders: dict[Any, Any] = {kinds: msgspec.json.Decoder(kinds) for kinds in _KINDS}
 
 
 def read_message(text: str | bytes, kinds: Any = AnyMessage) -> Any:

@@ -35,7 +35,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
 from . import EXAMPLES, css, read_asset, script
-from .messages import StartRequest, read_message
+from .messages import PictureRequest, StartRequest, read_message
 from .start import Start
 
 if TYPE_CHECKING:
@@ -423,6 +423,9 @@ class ViewerServer:
             Route("/examples/{name}", self._example),
             Route("/gaussians", self._gaussians),
             Route("/film", self._film),
+            Route("/style", self._style),
+            Route("/style", self._take_style, methods=["POST"]),
+            Route("/picture", self._picture, methods=["POST"]),
             Route("/photograph", self._photograph, methods=["POST"]),
             Route("/start", self._start_request, methods=["POST"]),
             Route("/start/piece", self._start_piece, methods=["POST"]),
@@ -496,7 +499,28 @@ class ViewerServer:
         return FileResponse(path)
 
     async def _gaussians(self, request: Request) -> Response:
-        return self._download(await asyncio.to_thread(self.session.gaussians), "restyled.ply")
+        query = request.query_params
+        shown = query.get("shown", "Now")
+        start = query.get("start", "Captured")
+        share = _integer(request, "percent") / 100 if "percent" in query else 1.0
+        suffix = f".{query.get('format', 'ply')}"
+        path = await asyncio.to_thread(self.session.gaussians, shown, start, min(1.0, share), suffix)
+        return self._download(path, f"{_file_name(shown)}{suffix}")
+
+    async def _style(self, request: Request) -> Response:
+        shown = request.query_params.get("shown", "Now")
+        path = await asyncio.to_thread(self.session.style_archive, shown)
+        return self._download(path, f"{_file_name(shown)}.zip")
+
+    async def _take_style(self, request: Request) -> Response:
+        data = await self.body(request)
+        await asyncio.to_thread(self.session.take_style, data)
+        return JSONResponse({})
+
+    async def _picture(self, request: Request) -> Response:
+        asked = read_message(await self.body(request), PictureRequest)
+        data = await asyncio.to_thread(self.session.picture, asked)
+        return Response(data, media_type="image/png")
 
     async def _film(self, request: Request) -> Response:
         path = self.session.state.film.path
@@ -511,7 +535,8 @@ class ViewerServer:
     async def _photograph(self, request: Request) -> Response:
         name = request.query_params.get("name", "photograph")
         data = await self.body(request)
-        photograph = await asyncio.to_thread(self.session.upload, data, name)
+        join = "join" in request.query_params
+        photograph = await asyncio.to_thread(lambda: self.session.upload(data, name, join=join))
         return JSONResponse({"card": photograph.number, "name": photograph.name})
 
     @property
@@ -563,6 +588,13 @@ def _line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return str(error)
+
+
+def _file_name(shown: str) -> str:
+    """What a saved file of a look is called, beside its scene."""
+    if shown == "Now":
+        return "restyled"
+    return "".join(c if c.isalnum() or c in "-_" else "-" for c in shown).strip("-").lower() or "look"
 
 
 def _integer(request: Request, name: str) -> int:

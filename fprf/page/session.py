@@ -7,9 +7,11 @@ is the only channel to a training: its newest checkpoint is shown, and as long a
 says so (`training.driver.watch`), for which training saves more often.
 """
 
+import hashlib
 import secrets
+import shutil
 import threading
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -17,31 +19,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import torch
 
-from ..errors import FprfError, UsageError
+from ..errors import DataError, FprfError, UsageError
 from ..io.images import Picture, encode
 from ..io.video import write_video
+from ..rendering.local_frame import read_offset
 from ..scenes import Scene
 from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig
+from ..style.files import read_style
 from ..training.driver import watch
 from ..training.loading import LoadedRun
 from . import messages
 from .drawing import (
-    FPS,
     Restyler,
     ScenePainter,
     cameras_of,
     film_frames,
     gaussian_colours,
     matching_regions,
+    picture_of,
+    rules_of,
     write_film_files,
+    write_style_of,
 )
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
-from .state import NOW, FilmProgress, Look, Photograph, SharedState, Shown
-from .uploads import Uploads, newest_step, shown_name, training_progress
+from .saved import PageFile, Regions, digest_of, folder_of, made_of, photograph_file, read_page, write_page
+from .state import NOW, FilmProgress, History, Look, Made, Photograph, SharedState, Shown, sliders
+from .uploads import Uploads, newest_step, shown_name, training_progress, unpack_style
 from .writer import about, packed_scene
 
 if TYPE_CHECKING:
@@ -53,6 +61,10 @@ _PREVIEW_JPEG_QUALITY = 72
 """Quality of a preview, which is soon replaced; by eye."""
 _FINAL_JPEG_QUALITY = 90
 """Quality of the whole picture; by eye."""
+SAVED_FORMATS = (".ply", ".spz", ".sog", ".glb")
+"""Endings of files of Gaussians that the page saves."""
+_SAVING_DELAY_SECONDS = 1.0
+"""From a change until it is kept on disk: a slider makes many; by eye."""
 
 
 @dataclass(frozen=True)
@@ -104,15 +116,104 @@ class Session:
         self._version = count(1)
         self._colours: dict[str, tuple[int, bytes]] = {}
         self._progress: dict[str, Any] | None = None
+        self._history = History()
+        self._digests: dict[Photograph, str] = {}
+        self._saving: threading.Timer | None = None
         self._load()
+        # What was made before comes back first; until then nothing is written over it.
+        self._folder: Path | None = None
+        self._of = ""
+        self._before: PageFile | None = None
+        if viewed.root is not None:
+            if viewed.capture is not None:
+                self._of = str(viewed.capture.path.resolve())
+            self._folder = folder_of(viewed.root, self._of)
+            self._before = read_page(self._folder)
 
     def __enter__(self) -> "Session":
         self._worker.start()
+        if self._before is not None:
+            self._worker.run_when_idle(self._restore(self._before))
         return self
 
     def __exit__(self, *_: object) -> None:
         self._worker.close()  # a film that is being made is left unfinished
+        if self._saving is not None:
+            self._saving.cancel()
+            self._save()
         self.uploads.close()
+
+    def _restore(self, page: PageFile) -> Steps[None]:
+        """Bring back what was made before, beside what has been made since."""
+        assert self._folder is not None
+        found: dict[str, Photograph] = {}
+        for number, (digest, name) in enumerate(page.photographs.items()):
+            text = f"{number} of {len(page.photographs)} photographs of before"
+            self.tell("restoring", text, number / len(page.photographs))
+            try:
+                data = photograph_file(self._folder, digest).read_bytes()
+                found[digest] = self.restyler.encode(self.uploads.store(data), name)
+                self._digests[found[digest]] = digest
+            except (FprfError, OSError) as error:
+                self.notify(f"{name}: left out of what was kept: {error}", bad=True)
+            yield
+        for each in self.state.shelf:  # one that has come meanwhile takes the place of the one of before
+            if (digest := digest_of(each.path.read_bytes())) in found:
+                found[digest] = each
+        try:
+            made = made_of(page, found)
+            if page.regions is not None:
+                made = self._renumbered(made, page.regions)
+            self.apply(lambda state: state.joined(made), undoable=False)
+            self._photographs |= frozenset(found.values())
+        except FprfError as error:
+            self.notify(f"{self._folder}: {error}", bad=True)
+            self._folder = None  # nothing is written over it
+        self._before = None
+        self._save_soon()
+        self.tell("restoring", "", None)
+
+    def _renumbered(self, made: Made, regions: Regions) -> Made:
+        """What was made, with the regions that it speaks of as they are numbered now."""
+        now = self.restyler.encoders.scene_style
+        keys = torch.tensor(regions.keys).reshape(len(regions.keys), len(regions.mean))
+        if keys.shape[1] != now.keys.shape[1]:
+            self.notify("rules for regions were left out: the scene has other semantics now", bad=True)
+            looks = replace(made.look, rules=frozenset())
+            kept = tuple((name, replace(look, rules=frozenset())) for name, look in made.kept)
+            film = tuple(key._replace(look=replace(key.look, rules=frozenset())) for key in made.keys)
+            return replace(made, look=looks, kept=kept, keys=film)
+        before = now._replace(keys=keys, semantic_mean=torch.tensor(regions.mean))
+        return made.renumbered(matching_regions(before, now).tolist())
+
+    def _save_soon(self) -> None:
+        """Keep what was made in the scene's folder, a moment from now."""
+        with self._lock:
+            if self._folder is None or self._before is not None or self._saving is not None:
+                return
+            self._saving = threading.Timer(
+                _SAVING_DELAY_SECONDS, lambda: self._worker.run("save", self._save)
+            )
+            self._saving.daemon = True
+            self._saving.start()
+
+    def _save(self) -> None:
+        with self._lock:
+            self._saving = None
+            made = self.state.made
+            folder = self._folder
+        if folder is None:
+            return
+        regions = None
+        if any(look.rules for look in made.looks):
+            style = self.restyler.encoders.scene_style
+            keys = tuple(tuple(row) for row in style.keys.tolist())
+            regions = Regions(keys, tuple(style.semantic_mean.tolist()))
+        try:
+            write_page(folder, made, self._of, regions, self._digests)
+        except (FprfError, OSError) as error:
+            self._folder = None  # said once
+            self.notify(f"looks and photographs are not kept: {error}", bad=True)
 
     def _load(self) -> None:
         """Prepare what browsers are sent of Gaussians, or the painter of any other scene."""
@@ -148,7 +249,18 @@ class Session:
             training = []
         else:
             training = [("training", self._progress)]
-        return [("scene", scene), ("state", self.state.described()), *ready, *training]
+        return [("scene", scene), ("state", self._described()), *ready, *training]
+
+    def _described(self) -> dict[str, Any]:
+        """The state as the page reads it."""
+        history = self._history
+        return {
+            **self.state.described(),
+            "defaults": sliders(self.viewed.style),
+            "undo": bool(history.before),
+            "redo": bool(history.after),
+            "keeps": str(self._folder) if self._folder is not None else "",
+        }
 
     def handle(self, client: Hashable, message: messages.AnyMessage) -> None:
         """Do what a client asks for. Raises FprfError with what is wrong with it."""
@@ -167,16 +279,19 @@ class Session:
                 at = (min(message.x * width, width - 1e-3), min(message.y * height, height - 1e-3))
                 self._worker.run("pick", lambda: self._select(self.restyler.region_at(cameras, at)))
             case messages.Film():
-                self._record(message.seconds)
-            case messages.Keep(action="keep") if isinstance(self.viewed.scene, SplatScene):
-                # A look of Gaussians that is kept becomes a style of the page, with colours of its own.
-                self.apply(lambda state: state.changed(message))
-                name, look = self.state.kept[-1]
-                self._worker.run(("kept", name), lambda: self._colour(name, Shown(look)))
+                self._record(message)
+            case messages.Undo():
+                move = self._history.redo if message.again else self._history.undo
+                self.apply(lambda state: state.remade(move(state.made)), undoable=False)
             case _:
                 if isinstance(message, messages.Key) and message.camera is not None:
                     cameras_of([message.camera])  # refused where it is none
-                self.apply(lambda state: state.changed(message))
+                control: Hashable = None
+                if isinstance(message, messages.Set):
+                    control = message.name
+                if isinstance(message, messages.Card) and message.action == "weight":
+                    control = message.card
+                self.apply(lambda state: state.changed(message), control=control)
 
     def disconnect(self, client: Hashable) -> None:
         """Drop everything of a client."""
@@ -190,13 +305,33 @@ class Session:
         """Show a line of text to all clients."""
         self._post(None, f"said {next(self._version)}", {"type": "said", "text": text[:400], "bad": bad})
 
-    def apply(self, change: Callable[[SharedState], SharedState]) -> None:
-        """Replace the state for all clients. Raises what `change` raises."""
+    def tell(self, kind: str, what: str, share: float | None) -> None:
+        """Tell all clients how far something is that takes its time; done where `what` is empty."""
+        self._post(None, f"wait {kind}", {"type": "wait", "kind": kind, "what": what, "share": share})
+
+    def apply(
+        self,
+        change: Callable[[SharedState], SharedState],
+        *,
+        undoable: bool = True,
+        control: Hashable = None,
+    ) -> None:
+        """Replace the state for all clients. Raises what `change` raises.
+
+        What was made so far can be undone, if the change is to be `undoable`; changes of one `control` are
+        one step.
+        """
         # Clients change the state one after the other, each what the one before it left.
         with self._lock:
             before = self.state
             self.state = change(self.state)
             now = self.state
+            remade = now.made != before.made
+            if remade and undoable:
+                self._history.note(before.made, control)
+        if remade:
+            self._save_soon()
+            self._colour_kept(before, now)
         if now.picked is not None and now.look != before.look:
             region = now.picked.region  # what it takes has changed
             self._worker.run("select", lambda: self._select(region))
@@ -205,25 +340,41 @@ class Session:
         if now.shown != before.shown:
             self._refresh()
         if now != before:
-            self._post(None, "state", self.state.described())
+            self._post(None, "state", self._described())
 
-    def upload(self, data: bytes, name: str) -> Photograph:
-        """Decode and encode a photograph and restyle the scene with it. Raises DataError for what is none."""
+    def _colour_kept(self, before: SharedState, now: SharedState) -> None:
+        """A look of Gaussians that is kept is a style of the page, with colours of its own."""
+        if not isinstance(self.viewed.scene, SplatScene):
+            return
+        known = dict(before.kept)
+        for name in known.keys() - dict(now.kept).keys():
+            self._worker.run(("kept", name), partial(self._colours.pop, name, None))
+        for name, look in now.kept:
+            if known.get(name) != look:
+                self._worker.run(("kept", name), partial(self._colour, name, Shown(look)))
+
+    def upload(self, data: bytes, name: str, *, join: bool = False) -> Photograph:
+        """Decode and encode a photograph and restyle the scene with it, and with those that it is to `join`.
+        Raises DataError for what is none.
+        """
         path = self.uploads.store(data)
 
         def add() -> Photograph:
             photograph = self.restyler.encode(path, self.state.unused_name(shown_name(name)))
-            self.apply(lambda state: state.added(photograph))
+            self.apply(lambda state: state.added(photograph, join))
             # Photographs that left the shelf and that no look needs go, with what was made of them: some 6 MB
             # each.
-            used = self.state.in_use | frozenset(self.state.shelf)
-            for gone in {*self._photographs, photograph} - used:
-                gone.path.unlink(missing_ok=True)
-            self._photographs = used
-            self.restyler.retain(used)
+            self._drop_unused([photograph])
             return photograph
 
         return self._worker.result(add)
+
+    def _drop_unused(self, new: Iterable[Photograph]) -> None:
+        used = self.state.in_use | frozenset(self.state.shelf) | self._history.photographs
+        for gone in {*self._photographs, *new} - used:
+            gone.path.unlink(missing_ok=True)
+        self._photographs = used
+        self.restyler.retain(used)
 
     def warm_up(self) -> None:
         """Prepare what the first photograph needs while nobody waits: decoder, encoders, kernels, a style."""
@@ -262,9 +413,11 @@ class Session:
                 self._post(None, kind, message)
             # Regions are measured anew, in any order: what is pinned is found again among them.
             picked = self.state.picked
-            if before is not None and (picked is not None or any(look.rules for look in self.state.looks)):
+            looks = (*self.state.looks, *self._history.looks)
+            if before is not None and (picked is not None or any(look.rules for look in looks)):
                 regions = matching_regions(before, self.restyler.encoders.scene_style).tolist()
-                self.apply(lambda state: state.renumbered(regions))
+                self._history.renumber(regions)
+                self.apply(lambda state: state.renumbered(regions), undoable=False)
                 if picked is not None:
                     self._select(regions[picked.region])
             for name, look in self.state.kept:
@@ -288,35 +441,130 @@ class Session:
             raise UsageError(f"{name}: no such colours")
         return found[1]
 
-    def gaussians(self) -> Path:
-        """The Gaussians in the look of now, as a .ply file. Raises UsageError for a scene without any."""
+    def gaussians(self, shown: str, start: str, share: float, suffix: str) -> Path:
+        """The Gaussians as they are shown, in a file: in the look `shown`, or so far on the way to it from the
+        look `start`, in [0, 1]. `suffix` is one of `SAVED_FORMATS`.
+
+        Raises UsageError for a scene without any, and for looks and formats that there are none of.
+        """
         viewed = self.viewed
         scene = self.viewed.scene
         if not isinstance(scene, SplatScene):
             raise UsageError(f"{viewed.name}: no Gaussians; `fprf export` makes some of a field")
+        if suffix not in SAVED_FORMATS:
+            raise UsageError(f"{suffix[:20]!r}: Gaussians are saved as {', '.join(SAVED_FORMATS)}")
+        look = self.state.look_named(shown)
+        before = self.state.look_named(start)
 
         def written() -> Path:
             # Under a name of its own: another page may still be reading the one before, which its open file
             # keeps.
-            for before in self.uploads.folder.glob("restyled-*.ply"):
-                before.unlink()
-            path = self.uploads.folder / f"restyled-{next(self._version)}.ply"
-            shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
+            for old in self.uploads.folder.glob("restyled-*"):
+                old.unlink()
+            path = self.uploads.folder / f"restyled-{next(self._version)}{suffix}"
+            gaussians = scene.restyled(self.restyler.restyle(look)).shown
+            if share < 1 and before != look:
+                first = scene.restyled(self.restyler.restyle(before)).shown.harmonics
+                gaussians = gaussians.recoloured(torch.lerp(first, gaussians.harmonics, share))
             # Of a capture all but the colours stays as it was in its file.
             if viewed.capture is None:
                 write_gaussians(
                     path,
-                    shown,
+                    gaussians,
                     antialiased=scene.antialiased,
                     views=scene.views,
                     plain=True,
                     origin=scene.origin,
                 )
             else:
-                write_capture(path, viewed.capture, shown.harmonics)
+                write_capture(path, viewed.capture, gaussians.harmonics, scene.views)
+            if any(offset := read_offset(path)):
+                place = " ".join(f"{x:g}" for x in offset)
+                self.notify(f"{suffix} holds positions relative to {place}; .ply holds them as they are")
             return path
 
         return self._worker.result(written)
+
+    def style_archive(self, shown: str) -> Path:
+        """A look as style.json with its photographs, in a .zip that `read_style_archive` and, unpacked, `fprf
+        stylize` take. Raises UsageError for the scene as captured.
+        """
+        look = self.state.look_named(shown)
+
+        def written() -> Path:
+            styled = self.restyler.styled(look)
+            if styled is None:
+                raise UsageError(f"{shown}: the scene as it is has no style; choose a look")
+            folder = self.uploads.folder / f"style-{next(self._version)}"
+            write_style_of(folder / "style.json", look, styled.controls.saved)
+            return Path(shutil.make_archive(str(folder), "zip", folder))
+
+        return self._worker.result(written)
+
+    def take_style(self, data: bytes) -> None:
+        """Take up a look from a .zip of `style_archive`, or a style.json alone whose photographs are on the
+        shelf. Raises DataError or ConfigError for what is none.
+        """
+        folder = self.uploads.folder / f"given-{next(self._version)}"
+        path = unpack_style(data, folder)
+        try:
+            file = read_style(path)
+            if file.style.masks or file.style.region_strength or file.style.between is not None:
+                self.notify("style: masks, strengths of regions and a second style are left out here")
+            photographs = []
+            for reference in file.style.references:
+                photographs.append(self._given(reference, file.sha256.get(reference)))
+
+            def add() -> None:
+                found = []
+                for known, png, name in photographs:
+                    if known is None:
+                        known = self.restyler.encode(png, self.state.unused_name(name))
+                    found.append(known)
+                rules = rules_of(self.restyler, file, found)
+                weights = file.style.weights or (1.0,) * len(found)
+                # The look itself holds photographs and rules; what the page has no control for is left out.
+                style = replace(
+                    file.style,
+                    references=(),
+                    weights=(),
+                    masks=(),
+                    pin=(),
+                    forbid=(),
+                    keep=(),
+                    region_strength=(),
+                    between=None,
+                )
+                look = Look(mix=tuple(zip(found, weights, strict=True)), style=style, rules=rules)
+                self.apply(lambda state: state.taken(look))
+                self._drop_unused(found)
+
+            self._worker.result(add)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _given(self, path: Path, sha256: str | None) -> tuple[Photograph | None, Path, str]:
+        """A photograph of a style that was sent: one of the shelf, or a file and its name."""
+        for each in self.state.shelf:
+            if sha256 is not None and hashlib.sha256(each.path.read_bytes()).hexdigest() == sha256:
+                return each, each.path, each.name
+        if not path.is_file():
+            raise DataError(
+                f"style.json: its photograph {path.name} is not here; give the .zip, or drop the photograph first"
+            )
+        return None, self.uploads.store(path.read_bytes()), shown_name(path.name)
+
+    def picture(self, asked: messages.PictureRequest) -> bytes:
+        """A PNG of a scene that is drawn here, as a client sees it. Raises UsageError as `cameras_of`."""
+        scene = self.viewed.scene
+        cameras = cameras_of([asked.camera], longest=asked.side)
+        look = self.state.look_named(asked.shown)
+
+        def work() -> Steps[Picture]:
+            restyle = self.restyler.restyle(look)
+            return (yield from picture_of(scene, cameras, restyle, asked.wipe))
+
+        return encode(self._worker.result_when_idle(work()), "png")
 
     def _refresh(self) -> None:
         """Show all clients what is shown now."""
@@ -357,7 +605,7 @@ class Session:
             picked = self.restyler.region_info(self.state.look, region)
         self.apply(lambda state: replace(state, picked=picked))
 
-    def _record(self, seconds: float) -> None:
+    def _record(self, film: messages.Film) -> None:
         """Make a film in the scene's folder while no client waits for a picture, one at a time."""
         with self._lock:
             if self.state.film.total and self.state.film.path is None:
@@ -367,12 +615,12 @@ class Session:
             films = self.viewed.root / "films"
             scene = self.viewed.scene
             folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
-            write_film_files(folder, self.state.keys, seconds, scene)
+            write_film_files(folder, self.state.keys, film, scene)
             self.apply(lambda state: replace(state, film=FilmProgress(total=1)))
         path = folder / "film.mp4"
 
-        def progress(film: FilmProgress) -> None:
-            self.apply(lambda state: replace(state, film=film))
+        def progress(now: FilmProgress) -> None:
+            self.apply(lambda state: replace(state, film=now))
 
         def rendered(frames: list[Steps[Picture]]) -> Iterator[Picture]:
             for done, frame in enumerate(frames, 1):
@@ -383,7 +631,7 @@ class Session:
             try:
                 # Frames are rendered one at a time, as the encoder asks for them.
                 frames = self._worker.result(lambda: film_frames(folder, scene))
-                write_video(path, rendered(frames), FPS)
+                write_video(path, rendered(frames), film.fps)
             except Exception as error:  # whatever it is, the next film can be made
                 progress(FilmProgress())
                 self.notify(f"film: {error}", bad=True)

@@ -5,7 +5,7 @@ A look says how a scene is coloured: `StyleConfig` holds what the sliders set, `
 style in the terms of `style.json`.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -22,6 +22,7 @@ from ..style.config import StyleConfig, with_preset
 from ..style.dictionary import Reference
 from . import messages
 from .messages import SHELF, Camera
+from .writer import CAPTURED
 
 MapKind: TypeAlias = Literal["none", "matches", "regions"]
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
@@ -31,9 +32,13 @@ _MAX_KEPT_LOOKS = 64
 """Looks that are kept by name; by eye."""
 _MAX_KEYFRAMES = 64
 """Keyframes of a film; by eye."""
+_MAX_UNDONE = 50
+"""Steps that can be undone; by eye."""
+MAX_UNDONE_PHOTOGRAPHS = 6
+"""Photographs that left the shelf and come back with what is undone: some 6 MB each; by eye."""
 
 
-def _sliders(style: StyleConfig) -> dict[str, float]:
+def sliders(style: StyleConfig) -> dict[str, float]:
     """Values of the sliders of a style."""
     found = {}
     for name in get_args(messages.Slider):
@@ -168,36 +173,13 @@ class Shown(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilmProgress:
-    """A film that is being made, or was made last."""
-
-    done: int = 0
-    """Frames that are rendered."""
-    total: int = 0
-    """Frames of all; 0 = no film was asked for."""
-    path: Path | None = None
-    """Its file, once it is finished."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SharedState:
-    """State that all clients share; each has a camera of its own."""
+class Made:
+    """What users have made of a scene: it can be undone, and is kept in the scene's folder."""
 
     shelf: tuple[Photograph, ...] = ()
     look: Look = field(default_factory=Look)
-    together: bool = False
-    """A photograph that is dropped joins the others; else it becomes the style alone."""
-    map: MapKind = "none"
-    picked: RegionInfo | None = None
     kept: tuple[tuple[str, Look], ...] = ()
-    """Looks that were kept, by name."""
     keys: tuple[PageKeyframe, ...] = ()
-    film: FilmProgress = FilmProgress()
-
-    @property
-    def shown(self) -> Shown:
-        """The part of the state that is drawn."""
-        return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
 
     @property
     def looks(self) -> tuple[Look, ...]:
@@ -212,13 +194,150 @@ class SharedState:
             used.update(dict(look.mix))
         return frozenset(used)
 
+    def renumbered(self, regions: Sequence[int]) -> "Made":
+        """With region r as regions[r] in the rules of all looks: regions were measured again."""
+        kept = tuple((name, look.renumbered(regions)) for name, look in self.kept)
+        keys = tuple(key._replace(look=key.look.renumbered(regions)) for key in self.keys)
+        return replace(self, look=self.look.renumbered(regions), kept=kept, keys=keys)
+
+
+class History:
+    """What was made before each change, and what was undone. Changes of one control are one step."""
+
+    def __init__(self) -> None:
+        self.before: list[Made] = []
+        self.after: list[Made] = []
+        self._control: Hashable = None
+
+    def note(self, before: Made, control: Hashable = None) -> None:
+        """A change was made to what there was `before`, by a `control` where it is moved step by step."""
+        if control is None or control != self._control or not self.before:
+            self.before.append(before)
+        self._control = control
+        self.after.clear()
+        del self.before[:-_MAX_UNDONE]
+        while len(self.photographs) > MAX_UNDONE_PHOTOGRAPHS + len({*before.shelf} | before.in_use):
+            del self.before[0]
+
+    def undo(self, now: Made) -> Made:
+        """What there was before the last change. Raises UsageError where there was none."""
+        return self._moved(self.before, self.after, now, "undo: nothing was changed")
+
+    def redo(self, now: Made) -> Made:
+        """What was undone last. Raises UsageError where nothing was."""
+        return self._moved(self.after, self.before, now, "redo: nothing was undone")
+
+    def _moved(self, source: list[Made], other: list[Made], now: Made, fault: str) -> Made:
+        if not source:
+            raise UsageError(fault)
+        self._control = None
+        other.append(now)
+        return source.pop()
+
+    @property
+    def photographs(self) -> frozenset[Photograph]:
+        """Photographs that something needs which can be undone or done again."""
+        used: set[Photograph] = set()
+        for made in (*self.before, *self.after):
+            used |= {*made.shelf} | made.in_use
+        return frozenset(used)
+
+    @property
+    def looks(self) -> tuple[Look, ...]:
+        """All looks that can come back."""
+        return tuple(look for made in (*self.before, *self.after) for look in made.looks)
+
+    def renumber(self, regions: Sequence[int]) -> None:
+        """Regions were measured again: r is regions[r]."""
+        self.before = [made.renumbered(regions) for made in self.before]
+        self.after = [made.renumbered(regions) for made in self.after]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmProgress:
+    """A film that is being made, or was made last."""
+
+    done: int = 0
+    """Frames that are rendered."""
+    total: int = 0
+    """Frames of all; 0 = no film was asked for."""
+    path: Path | None = None
+    """Its file, once it is finished."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedState(Made):
+    """State that all clients share; each has a camera of its own."""
+
+    together: bool = False
+    """A photograph that is dropped joins the others; else it becomes the style alone."""
+    map: MapKind = "none"
+    picked: RegionInfo | None = None
+    film: FilmProgress = FilmProgress()
+
+    @property
+    def shown(self) -> Shown:
+        """The part of the state that is drawn."""
+        return Shown(self.look, self.map, None if self.picked is None else self.picked.region)
+
+    @property
+    def made(self) -> Made:
+        """The part that can be undone, and is kept."""
+        return Made(shelf=self.shelf, look=self.look, kept=self.kept, keys=self.keys)
+
+    def remade(self, made: Made) -> "SharedState":
+        """With other things made; no region is picked."""
+        return replace(self, shelf=made.shelf, look=made.look, kept=made.kept, keys=made.keys, picked=None)
+
     def renumbered(self, regions: Sequence[int]) -> "SharedState":
         """With region r as regions[r] in the rules of all looks; none is picked: regions were measured
         again.
         """
-        kept = tuple((name, look.renumbered(regions)) for name, look in self.kept)
-        keys = tuple(key._replace(look=key.look.renumbered(regions)) for key in self.keys)
-        return replace(self, look=self.look.renumbered(regions), kept=kept, keys=keys, picked=None)
+        return self.remade(self.made.renumbered(regions))
+
+    def joined(self, saved: Made) -> "SharedState":
+        """With what was kept of the scene before; what was made since stays, and its look where it has one."""
+        shelf = [*saved.shelf]
+        for each in self.shelf:
+            if each not in shelf:
+                shelf.append(each)
+        look = self.look if self.look.mix else saved.look
+        state = self.remade(
+            Made(
+                shelf=tuple(shelf),
+                look=look,
+                kept=tuple({**dict(saved.kept), **dict(self.kept)}.items()),
+                keys=(*saved.keys, *self.keys),
+            )
+        )
+        return state.bounded()
+
+    def taken(self, look: Look) -> "SharedState":
+        """In a look that was given, with its photographs on the shelf."""
+        shelf = [*self.shelf]
+        for photograph, _ in look.mix:
+            if photograph not in shelf:
+                shelf.append(photograph)
+        return replace(self, shelf=tuple(shelf), look=look, picked=None).bounded()
+
+    def bounded(self) -> "SharedState":
+        """With no more photographs on the shelf than it holds: the oldest that no look needs make room."""
+        state = self
+        while len(state.shelf) > SHELF:
+            spare = [each for each in state.shelf if each not in state.in_use] or [state.shelf[0]]
+            state = state.removed(spare[0])
+        return state
+
+    def look_named(self, name: str) -> Look:
+        """The look that a client sees under a name. Raises UsageError where there is none."""
+        if name == NOW:
+            return self.look
+        if name == CAPTURED:
+            return Look(style=self.look.style)
+        kept = dict(self.kept)
+        if name not in kept:
+            raise UsageError(f"{name}: no look is called so")
+        return kept[name]
 
     def photograph(self, number: int | None) -> Photograph:
         """A photograph of the shelf. Raises UsageError where it is not there."""
@@ -238,12 +357,12 @@ class SharedState:
             else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)
         )
 
-    def added(self, photograph: Photograph) -> "SharedState":
-        """With a new photograph on the shelf and in the look; the oldest one that no look needs makes
-        room.
+    def added(self, photograph: Photograph, join: bool = False) -> "SharedState":
+        """With a new photograph on the shelf and in the look, in which it joins the others if it is to; the
+        oldest one that no look needs makes room.
         """
         shelf = (*self.shelf, photograph)
-        together = self.together and self.look.mix
+        together = (self.together or join) and self.look.mix
         if together:
             look = self.look.weighted(photograph, 1.0, shelf)
         else:
@@ -251,11 +370,7 @@ class SharedState:
         look = replace(
             look, style=replace(look.style, strength=look.style.strength or 1.0)
         )  # else nothing is seen of it
-        state = replace(self, shelf=shelf, look=look, picked=None)
-        while len(state.shelf) > SHELF:
-            spare = [each for each in state.shelf if each not in state.in_use] or [state.shelf[0]]
-            state = state.removed(spare[0])
-        return state
+        return replace(self, shelf=shelf, look=look, picked=None).bounded()
 
     def removed(self, photograph: Photograph) -> "SharedState":
         """Without a photograph on the shelf and in the look; looks that were kept, and keys of the film, keep
@@ -271,7 +386,7 @@ class SharedState:
         look = self.look
         match message:
             case messages.Set():
-                if message.name not in _sliders(look.style):
+                if message.name not in sliders(look.style):
                     raise UsageError(f"{message.name}: the stylizer of this scene has no such field")
                 # The page sends numbers; those of fields of whole numbers become whole.
                 *slot, name = message.name.split(".")
@@ -305,22 +420,14 @@ class SharedState:
                     action = message.action
                 return replace(self, look=look.ruled(self.picked.region, action, named))
             case messages.Keep():
-                name = " ".join(message.name.split())[:40]
-                kept = dict(self.kept)
-                if message.action == "restore" and name in kept:
-                    return replace(self, look=kept[name])
-                if not name or name in (NOW, "Captured") or message.action == "restore":
-                    raise UsageError("keep look: give it a name of its own")
-                if len(kept.keys() - {name}) >= _MAX_KEPT_LOOKS:
-                    raise UsageError(f"keep look: at most {_MAX_KEPT_LOOKS} are kept")
-                kept.pop(name, None)  # a look that takes the place of another comes last
-                return replace(self, kept=(*kept.items(), (name, look)))
+                return self._kept(message)
             case messages.Key(action="add"):
                 if message.camera is None:
                     raise UsageError("key: a camera is needed")
                 if len(self.keys) >= _MAX_KEYFRAMES:
                     raise UsageError(f"film: at most {_MAX_KEYFRAMES} keys; remove one first")
-                return replace(self, keys=(*self.keys, PageKeyframe(message.camera, look)))
+                key = PageKeyframe(message.camera, self.look_named(message.shown))
+                return replace(self, keys=(*self.keys, key))
             case messages.Key():
                 keys = list(self.keys)
                 at = message.at
@@ -330,6 +437,25 @@ class SharedState:
                 if message.action == "earlier":
                     keys.insert(max(0, at - 1), key)
                 return replace(self, keys=tuple(keys))
+
+    def _kept(self, message: messages.Keep) -> "SharedState":
+        name = " ".join(message.name.split())[:40]
+        kept = dict(self.kept)
+        if message.action != "keep":
+            if name not in kept:
+                raise UsageError(f"look {name!r}: none is kept under this name")
+            if message.action == "restore":
+                return replace(self, look=kept[name])
+            del kept[name]
+            return replace(self, kept=tuple(kept.items()))
+        if not name or name in (NOW, CAPTURED):
+            raise UsageError("keep look: give it a name of its own")
+        if name in kept and kept[name] != self.look and not message.replace:
+            raise UsageError(f"keep look: {name!r} is there already; replace it, or choose another name")
+        if len(kept.keys() - {name}) >= _MAX_KEPT_LOOKS:
+            raise UsageError(f"keep look: at most {_MAX_KEPT_LOOKS} are kept")
+        kept.pop(name, None)  # a look that takes the place of another comes last
+        return replace(self, kept=(*kept.items(), (name, self.look)))
 
     def described(self) -> dict[str, Any]:
         """The state as the page reads it."""
@@ -366,7 +492,7 @@ class SharedState:
         return {
             "type": "state",
             "shelf": shelf,
-            "look": _sliders(self.look.style),
+            "look": sliders(self.look.style),
             "map": self.map,
             "picked": region,
             "kept": [name for name, _ in self.kept],

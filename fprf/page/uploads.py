@@ -10,6 +10,7 @@ of any size. A file is checked by its first bytes before any of it is written, a
 is whole.
 """
 
+import io
 import json
 import multiprocessing
 import os
@@ -17,6 +18,8 @@ import shutil
 import signal
 import tempfile
 import threading
+import zipfile
+import zlib
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path, PurePosixPath
@@ -188,6 +191,10 @@ _MAX_FOLDER_DEPTH = 6
 """Folders within each other; by eye."""
 _MAX_PART_CHARACTERS = 120
 """Characters of a part of a path: file systems take 255 bytes."""
+_MAX_STYLE_FILES = 40
+"""Files of a style: its photographs and their masks."""
+_MAX_STYLE_BYTES = 64 << 20
+"""Bytes of all files of a style, unpacked."""
 _LAST_LINE_BYTES = 4096
 """Bytes of the end of events.jsonl that hold its last line."""
 
@@ -339,6 +346,33 @@ def _begins_video(head: bytes) -> bool:
         return True
     # Packets of a transport stream begin with G, those of cameras after a time of four bytes.
     return b"G" in (head[:1], head[4:5])
+
+
+def unpack_style(data: bytes, folder: Path) -> Path:
+    """Write a style.json and its photographs, of a .zip or of a style.json alone, into a folder that is made;
+    return the style.json. Raises DataError for anything else.
+    """
+    folder.mkdir(parents=True)
+    path = folder / "style.json"
+    if not data.startswith(b"PK"):
+        path.write_bytes(data)
+        return path
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            rows = [row for row in archive.infolist() if not row.is_dir()]
+            if len(rows) > _MAX_STYLE_FILES or sum(row.file_size for row in rows) > _MAX_STYLE_BYTES:
+                limits = f"at most {_MAX_STYLE_FILES} files of {_MAX_STYLE_BYTES >> 20} MiB in all"
+                raise DataError(f"style: {len(rows)} files; {limits}")
+            for row in rows:
+                # Names without folders: nothing leads out of this one.
+                name = PurePosixPath(row.filename.replace("\\", "/")).name
+                if _is_plain(name):
+                    (folder / name).write_bytes(archive.read(row))
+    except (zipfile.BadZipFile, OSError, NotImplementedError, RuntimeError, zlib.error) as error:
+        raise DataError(f"style: no .zip that can be read ({error})") from error
+    if not path.is_file():
+        raise DataError("style: no style.json is in this .zip; give one that was saved here")
+    return path
 
 
 class SceneFiles:

@@ -131,7 +131,7 @@ def test_gaussians_take_photographs_looks_are_kept_and_two_pages_agree(world: Wo
         other.wait_for_function("() => window.fprf?.place.splats.styles.has('Now')", timeout=60_000)
         page.locator("[data-look=strength]").fill("0.5")
         state(other, "state.look.strength === 0.5")
-        page.locator("#panel summary", has_text="More").click()
+        page.locator("#panel summary", has_text="Looks").click()
         page.locator("#keep-name").fill("faint")
         page.locator("#keep button").click()
         other.wait_for_function("() => fprf.place.splats.styles.has('faint')", timeout=60_000)
@@ -139,6 +139,7 @@ def test_gaussians_take_photographs_looks_are_kept_and_two_pages_agree(world: Wo
         assert other.evaluate("() => document.documentElement.scrollWidth") == 400
         other.close()
         before = page.evaluate("() => [...fprf.place.splats.colours.get('Now').rows.subarray(0, 400)]")
+        page.locator("#panel summary", has_text="More").click()
         page.locator("#map").select_option("regions")
         page.wait_for_function(
             "(b) => fprf.place.splats.colours.get('Now').rows.subarray(0, 400).some((x, i) => x !== b[i])",
@@ -209,6 +210,74 @@ def test_a_double_click_picks_nothing_and_escape_undoes_a_pick(world: World) -> 
             state(page, "state.picked !== null")
             page.keyboard.press("Escape")
             state(page, "state.picked === null")
+
+
+def test_what_is_made_is_kept_and_a_lost_viewer_is_said(world: World, tmp_path: Path) -> None:
+    viewed = Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "ball")
+    access = Access("127.0.0.1", None)
+    first = ViewerServer(access, 0)
+    first.open(lambda: viewed, warm=False)
+    with front(first.address) as page:
+        with first:
+            page.set_input_files("#photographs", [str(path) for path in world.references])
+            found = state(page, "state.shelf.length === 2")
+            assert [row["weight"] for row in found["shelf"]] == [1, 1], "several at once are mixed"
+            page.locator("#panel summary", has_text="Looks").click()
+            page.fill("#keep-name", "dusk")
+            page.locator("#keep button").click()
+            state(page, "state.kept.length === 1")
+            strength = page.locator("[data-look=strength]")
+            strength.fill("0.4")
+            state(page, "state.look.strength === 0.4")
+            # A name that is there is asked about.
+            page.locator("#keep button").click()
+            page.locator("dialog button", has_text="Cancel").click()
+            page.locator("#keep button").click()
+            page.locator("dialog button", has_text="Replace it").click()
+            page.wait_for_function("() => fprf.live.state.undo")
+            page.keyboard.press("Control+z")
+            page.keyboard.press("Control+z")
+            state(page, "state.look.strength === 1")
+            page.keyboard.press("Control+Shift+z")
+            state(page, "state.look.strength === 0.4")
+            strength.dblclick()
+            state(page, "state.look.strength === 1")
+            page.locator("#panel summary", has_text="Film").click()
+            page.locator("#add-key").click()
+            state(page, "state.keys.length === 1")
+        page.locator("#said .wait", has_text="Connection lost").wait_for()
+        key = page.evaluate("() => fprf.live.scene.key")
+        page.locator("#add-key").click()
+        page.locator("#said .bad", has_text="That was not done").wait_for()
+        page.locator("#save-ply").click()
+        page.locator("#said .bad", has_text="the viewer does not answer").wait_for()
+        with ViewerServer(access, first.port) as server:
+            server.open(lambda: viewed, warm=False)
+            page.wait_for_function(
+                """(key) => window.fprf && fprf.live.scene.key !== key
+                  && fprf.live.state.kept.length && fprf.live.state.shelf.length === 2""",
+                arg=key,
+                timeout=120_000,
+            )
+            assert len(page.evaluate("() => fprf.live.state.keys")) == 1
+            page.wait_for_function("() => fprf.place.splats.styles.has('dusk')")
+            page.locator("#said .wait").wait_for(state="detached")
+            # What is shown is what is saved.
+            page.evaluate("() => fprf.stage.choose('Captured')")
+            with page.expect_download(timeout=120_000) as downloaded:
+                page.locator("#save-ply").click()
+            assert downloaded.value.suggested_filename == "ball-captured.ply"
+            downloaded.value.save_as(tmp_path / "captured.ply")
+            plain = viewed.scene.gaussians.harmonics  # type: ignore[attr-defined]
+            assert torch.allclose(
+                read_capture(tmp_path / "captured.ply").gaussians.harmonics, plain, atol=1e-6
+            )
+            page.select_option("#scale", "2")
+            with page.expect_download(timeout=120_000) as downloaded:
+                page.locator("#save-picture").click()
+            downloaded.value.save_as(tmp_path / "picture.png")
+            wide = page.evaluate("() => [fprf.place.canvas.height, fprf.place.canvas.width]")
+            assert cv2.imread(str(tmp_path / "picture.png")).shape[:2] == (2 * wide[0], 2 * wide[1])
 
 
 def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:

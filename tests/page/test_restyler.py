@@ -3,7 +3,6 @@
 import json
 from collections.abc import Generator, Hashable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +201,8 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(
     faint = Look(mix=((a, 1.0),), style=replace(few, strength=0.75))
     folder = run / "films" / "0001"
     folder.mkdir(parents=True)
-    write_film_files(folder, keys_of(scene, [Look(), one, two, faint, one]), 0.125, scene, side=32)
+    film = messages.Film(seconds=0.125, side=64)
+    write_film_files(folder, keys_of(scene, [Look(), one, two, faint, one]), film, scene)
     rows = json.loads((folder / "keys.json").read_text())["keyframes"]
     numbers = (None, 1, 2, 3, 1)  # one file a look
     assert rows == [{"frame": 3 * i, "style": n and f"style-{n}/style.json"} for i, n in enumerate(numbers)]
@@ -221,13 +221,14 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(
 
 def test_paths_pass_through_their_keys(world: World) -> None:
     keys = keys_of(world.load(), [Look()] * 4)
-    path = film_cameras(keys, 0.2, side=32)
-    assert len(path) == 3 * 5 + 1 and path.size[0].tolist() == [32, 24]
+    path = film_cameras(keys, messages.Film(seconds=0.2, side=64))
+    assert len(path) == 3 * 5 + 1 and path.size[0].tolist() == [64, 48]
+    assert len(film_cameras(keys, messages.Film(seconds=0.2, side=64, fps=60))) == 3 * 12 + 1
     assert np.allclose(path.pose[::5, :, 3], [key.camera.place for key in keys], atol=1e-9)
-    assert len(film_cameras(keys[:1], 0.2)) == 1
-    for some, seconds in ((), 0.2), (keys, 400.0):
+    assert len(film_cameras(keys[:1], messages.Film(seconds=0.2))) == 1
+    for some, film in ((), messages.Film()), (keys, messages.Film(seconds=400.0)):
         with pytest.raises(UsageError, match="film"):
-            film_cameras(some, seconds)
+            film_cameras(some, film)
 
 
 def test_a_film_that_cannot_be_written_leaves_room_for_the_next(
@@ -238,15 +239,14 @@ def test_a_film_that_cannot_be_written_leaves_room_for_the_next(
         raise OSError("disk full")
 
     scene = session.viewed.scene
-    monkeypatch.setattr(viewer_session, "write_film_files", partial(write_film_files, side=64))
     session.apply(lambda state: replace(state, keys=keys_of(scene, [Look()] * 2)))
     with monkeypatch.context() as patch:
         patch.setattr(viewer_session, "write_video", full)
-        session.handle(1, messages.Film(seconds=1.0))
+        session.handle(1, messages.Film(seconds=1.0, side=64))
         listener.until_said("disk full")
-    session.handle(1, messages.Film(seconds=0.2))
+    session.handle(1, messages.Film(seconds=0.2, side=64))
     with pytest.raises(UsageError, match="one is being made"):
-        session.handle(1, messages.Film(seconds=0.2))
+        session.handle(1, messages.Film(seconds=0.2, side=64))
     until(lambda: session.state.film.path is not None)
     film = session.state.film
     path = film.path

@@ -1,11 +1,15 @@
+import io
 import json
 import sys
 import threading
+import zipfile
 import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from session_helpers import Listener, camera_of
@@ -16,9 +20,10 @@ from fprf.page import messages
 from fprf.page.messages import SHELF
 from fprf.page.render_worker import Steps
 from fprf.page.server import Access, ViewerServer
-from fprf.page.session import Session
-from fprf.page.state import SharedState
+from fprf.page.session import SAVED_FORMATS, Session, view_of_run
+from fprf.page.state import MAX_UNDONE_PHOTOGRAPHS, SharedState
 from fprf.splats.files import read_capture
+from fprf.training.loading import open_run
 
 
 def unpacked(body: bytes) -> tuple[dict[str, object], dict[str, bytes]]:
@@ -70,11 +75,25 @@ def test_a_photograph_recolours_gaussians_and_they_can_be_saved(
         listener.until(lambda count=count: any(kind == "colours Now" for _, kind, _ in listener.sent[count:]))  # type: ignore[misc]
     with pytest.raises(UsageError, match="no such colours"):
         splats.colours("else")
-    saved = read_capture(splats.gaussians()).gaussians
     scene = splats.viewed.scene
-    assert torch.equal(saved.means, scene.gaussians.means) and not torch.equal(
-        saved.harmonics, scene.gaussians.harmonics
-    )
+
+    def saved(shown: str, start: str = "Captured", share: float = 1.0, suffix: str = ".ply") -> Any:
+        return read_capture(splats.gaussians(shown, start, share, suffix)).gaussians
+
+    plain = scene.gaussians.harmonics
+    now = saved("Now")
+    assert torch.equal(now.means, scene.gaussians.means) and not torch.equal(now.harmonics, plain)
+    # What is shown is what is saved.
+    assert torch.equal(saved("Captured").harmonics, plain)
+    assert torch.allclose(saved("Now", share=0.5).harmonics, (now.harmonics + plain) / 2, atol=1e-6)
+    splats.handle(1, messages.Set(name="strength", value=0.0))
+    assert torch.equal(saved("Now").harmonics, plain)
+    assert torch.equal(saved("dusk").harmonics, now.harmonics)
+    for suffix in SAVED_FORMATS:
+        assert len(saved("dusk", suffix=suffix)) > 350
+    for wrong in (("no such", "Captured", 1.0, ".ply"), ("Now", "Captured", 1.0, ".exe")):
+        with pytest.raises(UsageError):
+            splats.gaussians(*wrong)
 
 
 def test_a_client_may_come_while_looks_are_coloured(
@@ -161,9 +180,11 @@ def test_an_unexpected_error_is_told_and_nothing_stops(session: Session, listene
 
 
 def test_photographs_that_left_the_shelf_are_deleted(session: Session, world: World) -> None:
-    for _ in range(SHELF + 3):
+    for _ in range(SHELF + MAX_UNDONE_PHOTOGRAPHS + 4):
         session.upload(world.references[0].read_bytes(), "x.png")
-    assert len(list(session.uploads.folder.glob("*.png"))) == SHELF == len(session.state.shelf)
+    assert len(session.state.shelf) == SHELF
+    kept = len(list(session.uploads.folder.glob("*.png")))
+    assert SHELF < kept <= SHELF + MAX_UNDONE_PHOTOGRAPHS + 1, "some can be brought back"
 
 
 def test_the_warm_up_leaves_nothing_behind(session: Session, listener: Listener) -> None:
@@ -209,3 +230,101 @@ def test_newer_states_of_a_training_are_shown_as_they_come(
     listener.until(lambda: splats.state.picked is not None)
     reloaded("Now", scene=scene, step=10)
     assert splats.state.picked is not None and splats.state.map == "regions"
+
+
+def test_what_was_made_comes_back_with_the_scene(run: Path, world: World, listener: Listener) -> None:
+    viewed = replace(view_of_run(open_run(run, "cpu")), pixels=64)
+    with Session(viewed, listener.post) as session:
+        session.upload(world.references[0].read_bytes(), "dusk.png")
+        session.upload(world.references[1].read_bytes(), "snow.png", join=True)
+        camera = camera_of(viewed.scene, 2)
+        session.handle(1, messages.Set(name="strength", value=0.7))
+        session.handle(1, messages.Pick(camera=camera, x=0.5, y=0.8))
+        listener.until(lambda: session.state.picked is not None)
+        assert session.state.picked is not None
+        region = session.state.picked.region
+        session.handle(1, messages.Region(action="keep"))
+        session.handle(1, messages.Keep(name="both", action="keep"))
+        session.handle(1, messages.Key(action="add", camera=camera, shown="both"))
+        session.handle(1, messages.Card(card=session.state.shelf[1].number, action="remove"))
+        before = session.state
+    with Session(viewed, listener.post) as session:
+        listener.until(lambda: len(session.state.kept) > 0)
+        now = session.state
+        assert [each.name for each in now.shelf] == ["dusk.png"]
+        assert [each.name for each, _ in now.look.mix] == ["dusk.png"] and now.look.style.strength == 0.7
+        name, look = now.kept[0]
+        assert name == "both" and [each.name for each, _ in look.mix] == ["dusk.png", "snow.png"]
+        assert look.rules == {(region, "keep", None)} and now.keys[0].camera == before.keys[0].camera
+        assert now.keys[0].look == look
+        # What is given again is not there twice, and the oldest document is not lost.
+        session.upload(world.references[0].read_bytes(), "dusk.png")
+    assert {path.name for path in run.glob("page*")} == {"page"}
+
+
+def test_a_page_of_another_version_is_left_alone(run: Path, world: World, listener: Listener) -> None:
+    (run / "page").mkdir()
+    (run / "page" / "page.json").write_text('{"format": 99}')
+    viewed = replace(view_of_run(open_run(run, "cpu")), pixels=64)
+    with Session(viewed, listener.post) as session:
+        session.upload(world.references[0].read_bytes(), "dusk.png")
+    assert (run / "page" / "page.json").read_text() == '{"format": 99}'
+    assert (run / "page-2" / "page.json").is_file()
+
+
+def test_changes_are_undone_and_photographs_come_back(session: Session, world: World) -> None:
+    card = session.upload(world.references[0].read_bytes(), "dusk.png")
+    session.handle(1, messages.Card(card=card.number, action="remove"))
+    assert session.state.shelf == ()
+    session.handle(1, messages.Undo())
+    assert session.state.shelf == (card,) and card.path.is_file() and session.state.look.mix == ((card, 1.0),)
+    session.handle(1, messages.Undo(again=True))
+    assert session.state.shelf == () and session.hello()[1][1]["undo"] and not session.hello()[1][1]["redo"]
+
+
+def test_a_style_is_saved_and_taken_up_again(session: Session, world: World, listener: Listener) -> None:
+    session.upload(world.references[0].read_bytes(), "dusk.png")
+    second = session.upload(world.references[1].read_bytes(), "snow.png", join=True)
+    session.handle(1, messages.Set(name="luminance", value=0.25))
+    session.handle(1, messages.Pick(camera=camera_of(session.viewed.scene, 2), x=0.5, y=0.8))
+    listener.until(lambda: session.state.picked is not None)
+    session.handle(1, messages.Region(action="pin", card=second.number))
+    look = session.state.look
+    data = session.style_archive("Now").read_bytes()
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert sorted(archive.namelist()) == ["1-dusk.png", "2-snow.png", "style.json"]
+        alone = archive.read("style.json")
+    for photograph in session.state.shelf:
+        session.handle(1, messages.Card(card=photograph.number, action="remove"))
+    with pytest.raises(DataError, match=r"1-dusk\.png is not here; give the \.zip"):
+        session.take_style(alone)
+    session.take_style(data)
+    found = session.state.look
+    assert found.style == look.style and [weight for _, weight in found.mix] == [1.0, 1.0]
+    assert [(rule.region, rule.action) for rule in found.rules] == [
+        (rule.region, rule.action) for rule in look.rules
+    ]
+    assert next(iter(found.rules)).photograph is found.mix[1][0]
+    session.handle(1, messages.Set(name="luminance", value=0.5))
+    session.take_style(alone)
+    assert session.state.look == found and len(session.state.shelf) == 2, "its photographs are on the shelf"
+    for wrong in (b"PK\3\4 no archive", b"{}", b"\xff"):
+        with pytest.raises(FprfError):
+            session.take_style(wrong)
+    with pytest.raises(UsageError, match="has no style"):
+        session.style_archive("Captured")
+
+
+def test_a_picture_of_a_field_is_what_is_shown_at_any_size(session: Session, world: World) -> None:
+    session.upload(world.references[0].read_bytes(), "dusk.png")
+    camera = camera_of(session.viewed.scene, 2)
+
+    def picture(**asked: Any) -> np.ndarray:
+        data = session.picture(messages.PictureRequest(camera=camera, side=128, **asked))
+        return cv2.imdecode(np.frombuffer(data, np.uint8), 1)
+
+    plain = picture(shown="Captured")
+    now = picture()
+    wiped = picture(wipe=0.5)
+    assert plain.shape == (96, 128, 3) and np.abs(plain.astype(int) - now).mean() > 2
+    assert np.array_equal(wiped[:, :64], plain[:, :64]) and np.array_equal(wiped[:, 64:], now[:, 64:])

@@ -17,7 +17,7 @@ from fprf.errors import ConfigError, DataError, UsageError
 from fprf.page import messages
 from fprf.page.drawing import cameras_of
 from fprf.page.messages import SHELF, Camera, Card, Keep, Key, Preset, Set, StartRequest, read_message
-from fprf.page.state import Look, PageKeyframe, Photograph, SharedState
+from fprf.page.state import MAX_UNDONE_PHOTOGRAPHS, History, Look, PageKeyframe, Photograph, SharedState
 from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import Reference
@@ -126,6 +126,12 @@ def test_kept_looks_outlive_their_photographs() -> None:
         == (("autumn light", state.look),)
         == state.changed(Keep(name="autumn light", action="keep")).kept
     )
+    other = state.changed(Set(name="strength", value=0.3))
+    with pytest.raises(UsageError, match="'autumn light' is there already"):
+        other.changed(Keep(name="autumn light", action="keep"))
+    replaced = other.changed(Keep(name="autumn light", action="keep", replace=True))
+    assert replaced.kept == (("autumn light", other.look),)
+    assert replaced.changed(Keep(name="autumn light", action="remove")).kept == ()
     gone = state.changed(Card(card=0, action="remove"))
     assert gone.shelf == () and gone.look.plain and gone.kept == state.kept and A in gone.in_use
     assert gone.changed(Keep(name="autumn light", action="restore")).look == state.look
@@ -134,6 +140,52 @@ def test_kept_looks_outlive_their_photographs() -> None:
     for name in ("  ", "one too many", "Now"):
         with pytest.raises(UsageError, match="keep look"):
             state.changed(Keep(name=name, action="keep"))
+
+
+def test_what_was_changed_is_undone_and_done_again() -> None:
+    history = History()
+    states = [STATE]
+    messages_ = (
+        Set(name="strength", value=0.5),
+        Set(name="strength", value=0.4),
+        Set(name="bold", value=0.1),
+    )
+    for message in messages_:
+        history.note(states[-1].made, message.name)
+        states.append(states[-1].changed(message))
+    now = states[-1]
+    now = now.remade(history.undo(now.made))
+    assert now.look == states[2].look
+    now = now.remade(history.undo(now.made))
+    assert now.look == STATE.look, "a slider that is moved is one step"
+    now = now.remade(history.redo(now.made))
+    now = now.remade(history.redo(now.made))
+    assert now == states[-1]
+    for move in (history.redo, lambda made: history.undo(history.undo(history.undo(made)))):
+        with pytest.raises(UsageError):
+            move(now.made)
+
+
+def test_a_removed_photograph_comes_back_but_not_any_number_of_them() -> None:
+    history = History()
+    state = STATE
+    for number in range(10, 10 + 4 * SHELF):
+        history.note(state.made)
+        state = state.added(card(number))
+    used = {*state.shelf} | history.photographs
+    assert SHELF < len(used) <= SHELF + MAX_UNDONE_PHOTOGRAPHS + 1
+    gone = state.shelf[-1]
+    history.note(state.made)
+    removed = state.removed(gone)
+    assert removed.remade(history.undo(removed.made)).shelf == state.shelf
+
+
+def test_what_was_kept_joins_what_has_been_made_since() -> None:
+    saved = SharedState().added(A).changed(Keep(name="dusk", action="keep")).made
+    joined = SharedState().joined(saved)
+    assert joined.made == saved
+    since = SharedState().added(B).joined(saved)
+    assert since.shelf == (A, B) and since.look.mix == ((B, 1.0),) and dict(since.kept) == dict(saved.kept)
 
 
 def test_keys_are_added_moved_and_removed() -> None:
@@ -147,6 +199,10 @@ def test_keys_are_added_moved_and_removed() -> None:
     for number in range(3):
         state = state.changed(Key(action="add", camera=camera(number)))
     assert numbers(state) == [0, 1, 2] and state.keys[0] == PageKeyframe(camera(0), state.look)
+    named = state.changed(Keep(name="dusk", action="keep")).changed(Set(name="strength", value=0.2))
+    for shown, look in (("Now", named.look), ("dusk", state.look), ("Captured", None)):
+        found = named.changed(Key(action="add", camera=camera(3), shown=shown)).keys[-1].look
+        assert found == look or (look is None and found.plain), "what is shown is what is kept"
     assert numbers(state.changed(Key(action="earlier", at=2))) == [0, 2, 1]
     assert numbers(state.changed(Key(action="earlier", at=0))) == [0, 1, 2]
     assert numbers(state.changed(Key(action="remove", at=1))) == [0, 2]
@@ -175,13 +231,26 @@ MESSAGES: list[dict[str, Any]] = [
     {"type": "map", "map": "regions"},
     {"type": "keep", "name": "dusk", "action": "keep"},
     {"type": "key", "action": "add", "camera": CAMERA},
-    {"type": "film", "seconds": 2},
+    {"type": "film", "seconds": 2, "side": 1920, "fps": 60},
+    {"type": "undo", "again": True},
 ]
 
 
 def test_what_the_page_sends_passes() -> None:
     kinds = {type(read_message(json.dumps(message))).__name__ for message in MESSAGES}
-    assert kinds == {"ViewRequest", "Set", "Preset", "Card", "Pick", "Region", "Map", "Keep", "Key", "Film"}
+    assert kinds == {
+        "ViewRequest",
+        "Set",
+        "Preset",
+        "Card",
+        "Pick",
+        "Region",
+        "Map",
+        "Keep",
+        "Key",
+        "Film",
+        "Undo",
+    }
 
 
 WRONG: list[tuple[str, dict[str, Any]]] = [

@@ -21,6 +21,7 @@ from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
 from fprf.page.drawing import write_film_files
+from fprf.page.messages import Film
 from fprf.page.messages import Camera
 from fprf.page.state import Look, PageKeyframe
 from fprf.rendering.local_frame import read_offset
@@ -170,7 +171,7 @@ def test_paths_and_places_are_given_in_the_capture_s_coordinates(
     key = PageKeyframe(
         Camera(tuple(cameras.pose[2, :, 3].tolist()), axes, (30, 30, 16, 12), (32, 24)), Look()
     )
-    write_film_files(tmp_path, (key, key), 0.5, scene.trained.scene, side=32)
+    write_film_files(tmp_path, (key, key), Film(seconds=0.5, side=32), scene.trained.scene)
     written = json.loads((tmp_path / "path.json").read_text())["camera_path"][0]["camera_to_world"]
     assert np.abs(np.array(written).reshape(4, 4)[:3, 3] - at).max() < 1e-6
     back = read_camera_path(tmp_path / "path.json", origin)[0]

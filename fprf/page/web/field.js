@@ -26,12 +26,19 @@ class Field {
     this.draw();
   }
 
+  /** Whether the scene as it was captured is shown, and nothing else. */
+  get plain() { return this.live.stage?.to === "Captured" && !this.live.stage.wiping; }
+
   /** Draw the look, and left of the line what was captured. */
   draw() {
     const { canvas, wipe } = this.live.place;
     const { look, captured } = this.last;
     const context = canvas.getContext("2d");
     if (!look) return;
+    if (this.plain && captured) {
+      context.drawImage(captured, 0, 0, canvas.width, canvas.height);
+      return;
+    }
     context.drawImage(look, 0, 0, canvas.width, canvas.height);
     if (wipe >= 0 && captured) {
       context.drawImage(captured, 0, 0, wipe * captured.width, captured.height, 0, 0, wipe * canvas.width, canvas.height);
@@ -42,7 +49,7 @@ class Field {
   /** Once a frame: ask for what the camera sees where it has moved, at most every `VIEW_MS`. */
   step() {
     const place = this.live.place;
-    const captured = place?.wipe >= 0;
+    const captured = place?.wipe >= 0 || this.plain;
     if (!place?.changed && this.captured === captured) return;
     const now = performance.now();
     if ((place.moved || this.captured !== captured) && now - this.sent > VIEW_MS) {

@@ -17,8 +17,25 @@ const MAX_NOTES = 4; // at the same time; by eye
  * @typedef {{card: number, name: string, weight: number, colour: ?string}} ShelfRow
  * @typedef {{region: number, share: number, taken: {name: string, share: number}[], rules: {action: string, card: ?number}[]}} PickedRegion
  * @typedef {{shelf: ShelfRow[], look: Object<string, number>, map: string, picked: ?PickedRegion, kept: string[],
- *   keys: CameraMessage[], film: {done: number, total: number, ready: boolean}}} SharedState
+ *   keys: CameraMessage[], film: {done: number, total: number, ready: boolean}, defaults: Object<string, number>,
+ *   undo: boolean, redo: boolean, keeps: string}} SharedState
  */
+
+const NO_ANSWER = "the viewer does not answer; is `fprf view` still running? This is tried again by itself.";
+
+/**
+ * Ask the server.
+ * @param {string} path
+ * @param {RequestInit=} init
+ * @returns {Promise<Response>} an error in words where nobody answers
+ */
+const asked = async (path, init) => {
+  try {
+    return await fetch(path, init);
+  } catch {
+    throw new Error(NO_ANSWER);
+  }
+};
 
 /**
  * Send a body to the server.
@@ -27,7 +44,7 @@ const MAX_NOTES = 4; // at the same time; by eye
  * @returns {Promise<any>} the JSON that it answers; an error with its words where it refuses
  */
 const post = async (path, body) => {
-  const answer = await fetch(path, { method: "POST", body });
+  const answer = await asked(path, { method: "POST", body });
   if (!answer.ok) throw new Error((await answer.text()).trim() || answer.statusText);
   return answer.json();
 };
@@ -42,9 +59,54 @@ const say = (text, bad = false) => {
   const close = () => line.remove();
   const line = make("button", { type: "button", textContent: text, className: bad ? "bad" : "", title: "close", onclick: close });
   at("said").append(line);
-  while (at("said").children.length > MAX_NOTES) at("said").firstChild.remove();
+  const notes = at("said").querySelectorAll("button");
+  for (const old of [...notes].slice(0, -MAX_NOTES)) old.remove();
   if (!bad) setTimeout(close, NOTE_MS);
   return line;
+};
+
+/** What takes its time, by its kind: lines that stay until it is done. @type {Map<string, HTMLElement>} */
+const waits = new Map();
+
+/**
+ * Show how far something is; without words it is done.
+ * @param {string} kind
+ * @param {string=} what
+ * @param {?number=} share in [0, 1]; null = not known
+ */
+const wait = (kind, what = "", share = null) => {
+  let line = waits.get(kind);
+  if (!what) {
+    line?.remove();
+    waits.delete(kind);
+    return;
+  }
+  if (!line) {
+    line = make("div", { className: "wait" }, make("span"), make("progress", { max: 1 }));
+    waits.set(kind, line);
+    at("said").prepend(line);
+  }
+  const [text, bar] = line.children;
+  text.textContent = what;
+  if (share === null) bar.removeAttribute("value");
+  else bar.value = share;
+};
+
+/**
+ * Ask before something is lost.
+ * @param {string} question
+ * @param {Object<string, () => void>} answers what is done, by its word
+ */
+const question = (text, answers) => {
+  const box = make("dialog", { className: "ask" }, make("p", { textContent: text }));
+  const row = make("div", { className: "row" });
+  for (const [word, act] of Object.entries({ ...answers, Cancel: () => {} })) {
+    row.append(make("button", { type: "button", className: "pill", textContent: word, onclick: () => { box.close(); act(); } }));
+  }
+  box.append(row);
+  box.onclose = () => box.remove();
+  (document.fullscreenElement ?? document.body).append(box);
+  box.showModal();
 };
 
 /**
@@ -64,6 +126,25 @@ const unpacked = async (answer) => {
     from += size;
   }
   return { head, parts };
+};
+
+/**
+ * The body of an answer, with how much of it has come.
+ * @param {Response} answer
+ * @param {(share: ?number) => void} tell
+ * @returns {Promise<Blob>}
+ */
+const counted = async (answer, tell) => {
+  const total = Number(answer.headers.get("content-length"));
+  const parts = [];
+  let done = 0;
+  for (const reader = answer.body.getReader(); ;) {
+    const { value, done: ended } = await reader.read();
+    if (ended) return new Blob(parts);
+    parts.push(value);
+    done += value.length;
+    tell(total ? done / total : null);
+  }
 };
 
 /** Let the browser save a file. */
@@ -105,13 +186,28 @@ class Live {
     this.socket.onmessage = ({ data }) => {
       this.queue = this.queue.then(() => this.hear(data)).catch((error) => say(error.message, true));
     };
-    this.socket.onclose = () => setTimeout(() => this.connect(), RECONNECT_MS);
+    this.socket.onopen = () => {
+      if (waits.has("connection")) say("Connected again.");
+      wait("connection");
+    };
+    this.socket.onclose = () => {
+      wait("connection", "Connection lost. It is tried again until the viewer answers; nothing can be changed meanwhile.");
+      setTimeout(() => this.connect(), RECONNECT_MS);
+    };
   }
+
+  get connected() { return this.socket.readyState === WebSocket.OPEN; }
 
   /** Send a message (messages.py). */
   tell(type, more = {}) {
-    if (["set", "preset", "card", "map", "region"].includes(type)) this.changed = true;
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type, ...more }));
+    if (!this.connected) {
+      // The camera asks again by itself; what somebody wanted done has to be told.
+      if (type !== "view") say("That was not done: there is no connection to the viewer.", true);
+      if (this.state) this.panel.fill(this.state);
+      return;
+    }
+    if (["set", "preset", "card", "map", "region", "undo"].includes(type)) this.changed = true;
+    this.socket.send(JSON.stringify({ type, ...more }));
   }
 
   /**
@@ -127,6 +223,7 @@ class Live {
     switch (message.type) {
       case "said": say(message.text, message.bad); break;
       case "start": this.began(message); break;
+      case "wait": wait(message.kind, message.what, message.share); break;
       case "loading": this.mode("loading"); break;
       case "scene": await this.open(message); break;
       case "training": this.trained(message); break;
@@ -173,7 +270,7 @@ class Live {
       this.place.touch();
       return;
     }
-    const { head, parts } = await unpacked(await fetch("/scene"));
+    const { head, parts } = await unpacked(await asked("/scene"));
     this.mode("scene");
     this.scene = scene;
     document.title = `${scene.name} - fprf`;
@@ -203,6 +300,10 @@ class Live {
     };
     this.place.listeners.drawn = () => at("place").classList.add("drawn");
     this.stage = new Stage(this.place, [{ name: "Captured" }]);
+    if (!splats) {
+      this.stage.add({ name: "Now" });
+      this.stage.choose("Now");
+    }
     this.stage.listeners.escape = () => {
       if (this.state?.picked) this.tell("region", { action: "close" });
     };
@@ -224,7 +325,7 @@ class Live {
   /** Fetch colours that the server has made, under a name of the stage. */
   async recolour({ name, version }) {
     const address = `/colours?name=${encodeURIComponent(name)}&version=${version}`;
-    const { head, parts } = await unpacked(await fetch(address));
+    const { head, parts } = await unpacked(await asked(address));
     await this.place.splats.add(name, head, parts.rows);
     this.place.touch(false);
     const { styles, from, to, wiping, amount } = this.stage;

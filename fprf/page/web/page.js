@@ -83,6 +83,16 @@ class Stage {
     this.set(this.from === null ? { from: style.name, to: style.name } : {});
   }
 
+  remove(name) {
+    const style = this.styles.find((each) => each.name === name);
+    if (!style) return;
+    style.card.remove();
+    [...at("from").options].find((option) => option.value === name)?.remove();
+    this.styles = this.styles.filter((each) => each !== style);
+    const instead = (kept) => (kept === name ? this.styles[0].name : kept);
+    this.set({ from: instead(this.from), to: instead(this.to) });
+  }
+
   // From the captured colours to a style, without a jump.
   choose(name) {
     const before = this.to;

@@ -1,6 +1,8 @@
 // The panel beside a scene: photographs on the shelf, sliders, what a region takes, looks that are kept, keyframes of a film.
 
 const SLIDER_MS = 40; // between two messages of a slider that moves; by eye
+const MAX_PICTURE = 16384; // pixels of a side of a picture that is saved here; larger ones take GiB
+const MAX_PAINTED = 4096; // of one that the server draws (messages.py)
 const FLIGHT_MS = 30; // between looks at whether a flight has ended; by eye
 
 /** Controls of what all pages share; what they show comes from the server. */
@@ -16,19 +18,107 @@ class Panel {
     this.filmed = true;
     for (const slider of document.querySelectorAll("[data-look]")) {
       const name = slider.dataset.look;
-      slider.oninput = () => this.steady(name, () => live.tell("set", { name, value: +slider.value }));
+      slider.oninput = () => {
+        this.number(slider);
+        this.steady(name, () => live.tell("set", { name, value: +slider.value }));
+      };
+      slider.ondblclick = () => {
+        this.pending.delete(name); // of the two clicks
+        slider.value = live.state.defaults[name];
+        this.number(slider);
+        live.tell("set", { name, value: live.state.defaults[name] });
+      };
     }
+    at("undo").onclick = () => live.tell("undo");
+    at("redo").onclick = () => live.tell("undo", { again: true });
+    addEventListener("keydown", (event) => {
+      if (!(event.ctrlKey || event.metaKey) || !/^Key[YZ]$/.test(event.code) || event.target.closest?.("input:not([type=range])")) return;
+      event.preventDefault();
+      live.tell("undo", { again: event.code === "KeyY" || event.shiftKey });
+    });
     at("map").onchange = () => live.tell("map", { map: at("map").value });
     at("gentle").onclick = () => live.tell("preset", { name: "gentle" });
     at("keep").onsubmit = (event) => {
       event.preventDefault();
-      live.tell("keep", { name: at("keep-name").value, action: "keep" });
+      this.keep(at("keep-name").value.trim().replace(/\s+/g, " "));
     };
-    at("add-key").onclick = () => live.tell("key", { action: "add", camera: live.camera() });
+    at("save-style").onclick = () => this.save("/style", { shown: live.stage.to });
+    at("open-style").onclick = () => at("style-file").click();
+    at("style-file").onchange = () => this.openStyle(at("style-file").files[0]);
+    at("add-key").onclick = () => live.tell("key", { action: "add", camera: live.camera(), shown: live.stage.to });
     at("play").onclick = () => this.play();
-    at("make-film").onclick = () => live.tell("film", { seconds: +at("seconds").value });
-    at("save-ply").onclick = () => download("/gaussians");
+    at("make-film").onclick = () => this.makeFilm();
+    at("save-ply").onclick = () => this.saveScene();
     at("save-picture").onclick = () => this.savePicture();
+  }
+
+  /** Keep the look of now; of a name that is there already it is asked. */
+  keep(name) {
+    const tell = (more = {}) => this.live.tell("keep", { name, action: "keep", ...more });
+    if (!this.live.state.kept.includes(name)) tell();
+    else question(`There is a look called “${name}”.`, { "Replace it": () => tell({ replace: true }) });
+  }
+
+  /** Numbers outside of a field's range are said, not sent. @returns {?number} */
+  limited(field, what) {
+    const value = field.valueAsNumber;
+    if (value >= +field.min && value <= +field.max) return value;
+    say(`${what}: ${field.value || "nothing"} is no number from ${field.min} to ${field.max}.`, true);
+    field.focus();
+    return null;
+  }
+
+  makeFilm() {
+    const seconds = this.limited(at("seconds"), "Seconds from key to key");
+    if (seconds !== null) this.live.tell("film", { seconds, side: +at("film-side").value, fps: +at("film-fps").value });
+  }
+
+  /**
+   * Fetch what the server makes and save it; what it says against it is shown.
+   * @param {string} path
+   * @param {Object<string, string>} query
+   * @param {string} what
+   */
+  async save(path, query, what = "style") {
+    wait("save", `Preparing the ${what} …`);
+    try {
+      const answer = await asked(`${path}?${new URLSearchParams(query)}`);
+      if (!answer.ok) throw new Error((await answer.text()).trim());
+      const name = /filename\*?=(?:utf-8'')?"?([^";]+)/i.exec(answer.headers.get("content-disposition") ?? "")?.[1] ?? what;
+      const blob = await counted(answer, (share) => wait("save", `Fetching the ${what} …`, share));
+      download(URL.createObjectURL(blob), decodeURIComponent(name));
+    } catch (error) {
+      say(error.message, true);
+    }
+    wait("save");
+  }
+
+  /** The scene as it is shown: in its look, or so far on the way to it. */
+  saveScene() {
+    const { from, to, amount, wiping } = this.live.stage;
+    if (this.live.state.map !== "none") say("The file holds the look; the map is on this page alone.");
+    const percent = wiping ? 100 : Math.round(100 * amount);
+    return this.save("/gaussians", { shown: to, start: from, percent, format: at("format").value.slice(1) }, "scene");
+  }
+
+  /** Take up a style that was saved. @param {?File} file */
+  async openStyle(file) {
+    at("style-file").value = "";
+    if (!file) return;
+    wait("style", `Taking up ${file.name} …`);
+    try {
+      this.live.changed = true;
+      await post("/style", file);
+    } catch (error) {
+      say(`${file.name}: ${error.message}`, true);
+    }
+    wait("style");
+  }
+
+  /** The number beside a slider. */
+  number(slider) {
+    const output = slider.parentElement.querySelector("output");
+    if (output) output.textContent = (+slider.value).toFixed(+slider.step < 1 ? 2 : 0);
   }
 
   /**
@@ -55,15 +145,38 @@ class Panel {
     for (const slider of document.querySelectorAll("[data-look]")) {
       const name = slider.dataset.look;
       slider.parentElement.hidden = !(name in state.look); // another stylizer has other fields
-      if (slider !== document.activeElement) slider.value = state.look[name];
+      const moving = slider === document.activeElement && slider.matches(":active");
+      if (!moving) slider.value = state.look[name];
+      this.number(slider);
     }
+    at("undo").disabled = !state.undo;
+    at("redo").disabled = !state.redo;
+    at("keeps").textContent = state.keeps ? `Looks, photographs and film are kept in ${state.keeps}` : "Nothing is kept of this scene: it has no folder.";
     at("map").value = state.map;
     at("hint").hidden = !state.shelf.length || Boolean(state.picked);
     this.fillRegion(state.picked, state.shelf);
     // Looks that were kept: where browsers draw they come with their colours.
     const { scene, stage } = this.live;
     if (scene && !scene.gaussians && stage) state.kept.forEach((name) => stage.add({ name }));
+    for (const { name } of [...(stage?.styles ?? [])]) {
+      if (!["Captured", "Now", ...state.kept].includes(name)) stage.remove(name);
+    }
+    this.fillKept(state.kept);
     this.fillFilm(state.keys, state.film);
+  }
+
+  /** Looks that were kept. @param {string[]} names */
+  fillKept(names) {
+    const button = (text, title, onclick, className = "pill") => make("button", { type: "button", className, textContent: text, title, onclick });
+    const remove = (name) => button("×", `forget ${name}`, () => this.live.tell("keep", { name, action: "remove" }), "close");
+    at("kept").replaceChildren(...names.map((name) => make("div", { className: "row" },
+      make("span", { textContent: name }), button("use", `go on from ${name}`, () => this.use(name)), remove(name))));
+  }
+
+  /** Go on from a look that was kept. */
+  use(name) {
+    this.live.tell("keep", { name, action: "restore" });
+    this.live.stage.choose("Now");
   }
 
   /** @param {ShelfRow[]} shelf */
@@ -176,10 +289,43 @@ class Panel {
     }
   }
 
-  /** What is seen, as large as it is here; WebGL keeps no picture, so it is drawn once more. */
-  savePicture() {
-    const { canvas, splats, camera, lens, look, scene } = this.live.place;
-    splats?.draw(camera.view, lens, look, { near: scene.near, background: scene.background, exact: true });
-    canvas.toBlob((blob) => download(URL.createObjectURL(blob), `${this.live.scene.name}.png`));
+  /** What is seen, once, twice or four times as large; WebGL keeps no picture, so it is drawn once more. */
+  async savePicture() {
+    const { place, scene, stage } = this.live;
+    const { canvas, splats } = place;
+    const by = +at("scale").value;
+    const name = `${scene.name}.png`;
+    if (!splats) {
+      const side = Math.min(MAX_PAINTED, by * Math.max(canvas.width, canvas.height));
+      return this.savePainted({ camera: this.live.camera(), side, shown: stage.to, wipe: place.wipe }, name);
+    }
+    const most = Math.min(MAX_PICTURE, splats.gl.getParameter(splats.gl.MAX_TEXTURE_SIZE));
+    const size = [canvas.width * by, canvas.height * by];
+    if (Math.max(...size) > most) {
+      say(`${size.join(" × ")} pixels are more than the ${most} a side that can be drawn here; choose a smaller size.`, true);
+      return undefined;
+    }
+    wait("picture", `Drawing ${size.join(" × ")} pixels …`);
+    await new Promise((done) => setTimeout(done, 50)); // the words come first
+    [canvas.width, canvas.height] = size;
+    splats.draw(place.camera.view, place.lens, place.look, { near: place.scene.near, background: place.scene.background, exact: true });
+    const blob = await new Promise((done) => canvas.toBlob(done));
+    place.resize();
+    place.touch();
+    wait("picture");
+    return download(URL.createObjectURL(blob), name);
+  }
+
+  /** A picture of a scene that the server draws. */
+  async savePainted(picture, name) {
+    wait("picture", `Drawing ${picture.side} pixels …`);
+    try {
+      const answer = await asked("/picture", { method: "POST", body: JSON.stringify({ type: "picture", ...picture }) });
+      if (!answer.ok) throw new Error((await answer.text()).trim());
+      download(URL.createObjectURL(await answer.blob()), name);
+    } catch (error) {
+      say(error.message, true);
+    }
+    wait("picture");
   }
 }

@@ -53,26 +53,33 @@ class Photographs {
    * @param {string} name
    */
   async example(name) {
-    const answer = await fetch(`/examples/${name}`);
+    const answer = await asked(`/examples/${name}`);
     if (answer.ok) await this.send([new File([await answer.blob()], name)]);
     else say(`${name}: ${answer.statusText}`, true);
   }
 
   /**
-   * Send photographs, one after the other; a refused one is named.
+   * Send photographs, one after the other; those after the first join it in the mix, and a refused one is named.
    * @param {Iterable<File>} files
    */
   async send(files) {
-    for (const file of [...files].slice(0, MAX_SENT)) {
-      const line = say(`${file.name} …`, true);
-      line.className = "";
+    const all = [...files];
+    const some = all.slice(0, MAX_SENT);
+    if (some.length < all.length) {
+      say(`${all.length} photographs: the first ${MAX_SENT} were taken, which is what fits beside a scene. Left out: ${
+        all.slice(MAX_SENT).map((file) => file.name).join(", ")}`, true);
+    }
+    let join = false;
+    for (const [k, file] of some.entries()) {
+      wait("photograph", `${file.name} …${some.length > 1 ? ` (${k + 1} of ${some.length})` : ""}`, some.length > 1 ? k / some.length : null);
       try {
         this.live.changed = true;
-        await post(`/photograph?name=${encodeURIComponent(file.name)}`, file);
+        await post(`/photograph?name=${encodeURIComponent(file.name)}${join ? "&join=1" : ""}`, file);
+        join = true;
       } catch (error) {
         say(`${file.name}: ${error.message}`, true);
       }
-      line.remove();
     }
+    wait("photograph");
   }
 }
