@@ -7,8 +7,8 @@
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
 - Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`,
   `start.py`.
-- What is shown, as values: `state.py`. The scene that is open, its photographs and its training:
-  `session.py`.
+- What is shown, as values: `state.py`; what of it is kept in the scene's folder: `saved.py`. The scene that
+  is open, its photographs and its training: `session.py`.
 - Its styles, and what they show, drawn step by step: `drawing.py`, in the thread of `render_worker.py`.
 """
 
