@@ -22,7 +22,7 @@ from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
 from fprf.fields.planes import PlanesField
 from fprf.interfaces import ContentField
-from fprf.ops import backend, dense, mixture, proposal, triplane
+from fprf.ops import adam, backend, dense, mixture, proposal, triplane
 from fprf.rendering.cameras import Cameras
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
@@ -38,9 +38,14 @@ from .subject import Subject, find, fresh_model, loop_of, stepper, test_view
 Patches = Sequence[tuple[object, str, object]]
 
 
-def never(*tensors: object, learns: bool | None = None) -> bool:
+def never(*tensors: object, learns: bool | None = None, eps: float = 0.0) -> bool:
     """No kernel applies."""
     return False
+
+
+def plain_variation(table: Tensor, resolutions: Sequence[int], gradient: object = None) -> Tensor:
+    """Total variation, and its gradient, in plain torch."""
+    return triplane.variation_reference(table, resolutions)
 
 
 KERNEL_LOOKUPS = FeatureStore.at
@@ -55,8 +60,9 @@ def plain_lookups(store: FeatureStore, view: Tensor, pixel: Tensor, rgb: Tensor)
 packed: dict[int, FeatureStore] = {}
 SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane, "usable", never)],
-    "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
-    "networks": [(dense, "usable", never)],
+    "tri-planes: total variation": [(triplane, "variation", plain_variation)],
+    "networks": [(dense, "usable", never), (dense, "usable_in_training", never)],
+    "Adam": [(adam, "usable", never)],
     "proposals and middles": [(proposal, "usable", never)],
     "styles of points": [(mixture, "usable", never)],
     "content and decoder joined": [(PlanesField, "colour", ContentField.colour)],

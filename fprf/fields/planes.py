@@ -99,10 +99,18 @@ class Planes(nn.Module):
         # gradient.
         table = torch.empty(triplane.rows(self.resolutions), channels).uniform_(0.1, 0.5, generator=generator)
         self.table = nn.Parameter(table)
+        self.gradient: triplane.HeldGradient | None = None
+
+    def hold_gradient(self) -> triplane.HeldGradient | None:
+        """Let kernels add to one gradient of the table from step to step, where that is worth it; who trains
+        clears it.
+        """
+        self.gradient = triplane.held(self.table)
+        return self.gradient
 
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N out"]:
         """Features, coarse scales first."""
-        return triplane.lookup(points, self.table, self.resolutions)
+        return triplane.lookup(points, self.table, self.resolutions, self.gradient)
 
     def density(
         self, points: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "out"]
@@ -118,7 +126,7 @@ class Planes(nn.Module):
 
     def variation(self) -> Tensor:
         """Total variation: mean squared difference of neighbouring nodes, summed over scales."""
-        return triplane.variation(self.table, self.resolutions)
+        return triplane.variation(self.table, self.resolutions, self.gradient)
 
 
 class PlanesField(ContentField):

@@ -19,7 +19,7 @@ of each.
 import numba
 import numpy as np
 
-from .simd import BLOCK, WIDE, load, maximum, narrow, repeat, store, traced
+from .simd import BLOCK, WIDE, load, maximum, narrow, repeat, splat, store, traced, where_greater
 from .threads import cached_jit
 
 _jit = cached_jit(parallel=True, nogil=True)
@@ -73,6 +73,15 @@ def add_shift(bias, at, side, s_at, out, to):
 
 
 @numba.njit(inline="always")
+def _shifted(biases, side, row, first, rows, width, out):
+    """out[r] = biases + side[row[first + r]] for a block of rows; 0 where they end."""
+    for r in range(rows):
+        for c in range(0, width, WIDE):
+            add_shift(biases, c, side, row[first + r] * width + c, out, r * width + c)
+    out[rows * width : BLOCK * width] = np.float32(0)
+
+
+@numba.njit(inline="always")
 def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, here, there, out, outputs):
     """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be
     `there`.
@@ -81,13 +90,9 @@ def _layers(source, at, depth, weights, biases, widths, side, row, first, rows, 
     start = biases
     s_row = 0
     if len(row) > 0:
-        width = widths[0]
         start = here
         s_row = widths[0]
-        for r in range(rows):
-            for c in range(0, width, WIDE):
-                add_shift(biases, c, side, row[first + r] * width + c, here, r * width + c)
-        here[rows * width : BLOCK * width] = np.float32(0)
+        _shifted(biases, side, row, first, rows, widths[0], here)
     w_at = 0
     b_at = 0
     layers = len(widths)
@@ -138,3 +143,109 @@ def network(x, inputs, weights, biases, widths, side, row, out, outputs):
         _layers(
             source, at, inputs, weights, biases, widths, side, row, first, rows, here, there, out, outputs
         )
+
+
+# In training every layer is kept. Its three products are one layer forward, the same with the weights as they
+# are for the gradient of its inputs, and `outer` for that of its weights.
+OUTER_ROWS = 4
+"""Outputs of a tile of `outer`: with 4 vectors of inputs 16 sums, which do not wait for each other."""
+_OUTER_POINTS = 128
+"""Points that all tiles take before the next ones: they and their gradients lie in the caches; by eye."""
+
+
+@traced
+def keep_positive(x, at, mask, m_at, out, to):
+    """out[to : to + WIDE] = x[at :] where mask[m_at :] is above 0, else 0."""
+    zero = splat(x, 0.0, WIDE)
+    store(out, to, where_greater(load(mask, m_at, WIDE), zero, load(x, at, WIDE), zero))
+
+
+@_jit
+def linear(x, weights, biases, side, row, mask, out):
+    """out [N outputs] = max(x [N inputs] weights + biases, floor), and 0 where `mask` [N outputs] is not above
+    0, if it is given. The floor stands behind the biases; `side` and `row` as of `network`.
+    """
+    width = len(biases) - 1
+    floor = biases[width]
+    inputs = len(weights) // width
+    count = len(x) // inputs
+    outputs = len(out) // count
+    for task in numba.prange((count + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        rows = min(BLOCK, count - first)
+        here = np.empty(BLOCK * width, np.float32)
+        source = x
+        at = first * inputs
+        if rows < BLOCK:
+            source = np.zeros(BLOCK * inputs, np.float32)
+            at = 0
+            source[: rows * inputs] = x[first * inputs : (first + rows) * inputs]
+        if len(row) > 0:
+            _shifted(biases, side, row, first, rows, width, here)
+            product(source, at, weights, 0, width, here, 0, width, here, inputs, floor)
+        else:
+            product(source, at, weights, 0, width, biases, 0, 0, here, inputs, floor)
+        if width == outputs:
+            to = first * outputs
+            for i in range(0, rows * outputs, WIDE):
+                if len(mask) > 0:
+                    keep_positive(here, i, mask, to + i, out, to + i)
+                else:
+                    store(out, to + i, load(here, i, WIDE))
+        else:
+            for r in range(rows):
+                for c in range(outputs):
+                    to = (first + r) * outputs + c
+                    kept = len(mask) == 0 or mask[to] > np.float32(0)
+                    out[to] = here[r * width + c] if kept else np.float32(0)
+
+
+@traced
+def add_outer(g, x, out, firsts, steps, count, columns):
+    """out[r, :] += sum over `count` points n of g[n, r] x[n, :] for OUTER_ROWS rows, : = columns vectors.
+
+    `firsts` are the first numbers of g, x and out, `steps` those from one row of g, and of x and out, to the
+    next.
+    """
+    g_at, x_at, o_at = firsts
+    g_step, x_step = steps
+    places = []
+    for r in range(OUTER_ROWS):
+        places += [(r, c) for c in range(columns)]
+
+    def step(n, sums):
+        inputs = [load(x, x_at + n * x_step + c * WIDE, WIDE) for c in range(columns)]
+        values = [narrow(g[g_at + n * g_step + r], WIDE) for r in range(OUTER_ROWS)]
+        return [each + values[r] * inputs[c] for each, (r, c) in zip(sums, places, strict=True)]
+
+    begin = [load(out, o_at + x_step * r + c * WIDE, WIDE) for r, c in places]
+    for (r, c), value in zip(places, repeat(count, begin, step), strict=True):
+        store(out, o_at + x_step * r + c * WIDE, value)
+
+
+@_jit
+def outer(g, outputs, x, inputs, slices, out):
+    """Add to out [slices outputs inputs] the products g [N outputs]^T x [N inputs], each of a slice of the
+    points.
+
+    Outputs are a multiple of OUTER_ROWS, inputs of WIDE.
+    """
+    count = len(g) // outputs
+    for part in numba.prange(slices):
+        end = (part + 1) * count // slices
+        for first in range(part * count // slices, end, _OUTER_POINTS):
+            points = min(_OUTER_POINTS, end - first)
+            steps = (outputs, inputs)
+            for o in range(0, outputs, OUTER_ROWS):
+                at = (part * outputs + o) * inputs
+                for i in range(0, inputs, 4 * WIDE):
+                    columns = min(4, (inputs - i) // WIDE)
+                    firsts = (first * outputs + o, first * inputs + i, at + i)
+                    if columns == 4:
+                        add_outer(g, x, out, firsts, steps, points, 4)
+                    elif columns == 3:
+                        add_outer(g, x, out, firsts, steps, points, 3)
+                    elif columns == 2:
+                        add_outer(g, x, out, firsts, steps, points, 2)
+                    else:
+                        add_outer(g, x, out, firsts, steps, points, 1)

@@ -125,15 +125,54 @@ def _compiles(device: torch.device) -> bool:
     return True
 
 
+class HeldGradient:
+    """Memory for the gradient of a large table on the CPU that outlives a step, so that the system need not
+    hand out and clear the same pages in each.
+
+    Kernels that are given it add to `table.grad` themselves, and tell autograd of no gradient. It is zero
+    between steps: whoever has used a gradient calls `clear`.
+    """
+
+    def __init__(self, table: Tensor) -> None:
+        self.table = table
+        self._memory: Tensor | None = None
+
+    def gradient(self) -> Annotated[Tensor, "rows F"]:
+        """The gradient of the table to add to: as it is, or zeros, which become its `grad`."""
+        if self.table.grad is None:
+            if self._memory is None:
+                self._memory = torch.zeros_like(self.table, memory_format=torch.contiguous_format)
+            self.table.grad = self._memory
+        return self.table.grad
+
+    def clear(self) -> None:
+        """Set the gradient to zero, and the `grad` of the table to None."""
+        if self.table.grad is not None and self.table.grad is self._memory:
+            self._memory.zero_()
+        self.table.grad = None
+
+
+def held(table: Tensor) -> HeldGradient | None:
+    """Memory for a table's gradient; None where the table is too small to gain by it, or not on the CPU."""
+    if table.numel() > _MAX_SLICED_NUMBERS and table.device.type == "cpu":
+        return HeldGradient(table)
+    return None
+
+
 def lookup(
-    points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
+    points: Annotated[Tensor, "N 3"],
+    table: Annotated[Tensor, "rows F"],
+    resolutions: Sequence[int],
+    gradient: HeldGradient | None = None,
 ) -> Annotated[Tensor, "N scales*F"]:
     """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3
     |value|).
+
+    Where a kernel computes the table's gradient on the CPU it is added to the one held.
     """
     if not (usable(points, table) or triton_usable(points, table)):
         return lookup_reference(points, table, resolutions)
-    result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions))  # type: ignore[no-untyped-call]
+    result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions), gradient)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -161,11 +200,15 @@ def weighed(
     return density, values
 
 
-def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
-    """`variation_reference`, fused and accumulated in float64 where the device has it."""
+def variation(
+    table: Annotated[Tensor, "rows F"], resolutions: Sequence[int], gradient: HeldGradient | None = None
+) -> Tensor:
+    """`variation_reference`, fused and accumulated in float64 where the device has it; the gradient as that of
+    `lookup`.
+    """
     if not usable(table, table):
         return variation_reference(table, resolutions)
-    result: Tensor = _Variation.apply(table, tuple(resolutions))  # type: ignore[no-untyped-call]
+    result: Tensor = _Variation.apply(table, tuple(resolutions), gradient)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -176,9 +219,16 @@ class _Lookup(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+    def forward(
+        ctx: Any,
+        points: Tensor,
+        table: Tensor,
+        resolutions: tuple[int, ...],
+        gradient: HeldGradient | None,
+    ) -> Tensor:
         ctx.save_for_backward(points, table)
         ctx.resolutions = resolutions
+        ctx.gradient = gradient
         if points.is_cuda:
             from . import triplane_triton
 
@@ -190,7 +240,7 @@ class _Lookup(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         points, table = ctx.saved_tensors
         to_points = to_table = None
         if points.is_cuda:
@@ -205,14 +255,16 @@ class _Lookup(torch.autograd.Function):
                 to_table = triplane_triton.backward(
                     points, table.detach().contiguous(), ctx.resolutions, grads[0]
                 )
-            return to_points, to_table, None
+            return to_points, to_table, None, None
         from . import triplane_kernels as kernels
 
         given = array(points), *_laid_out(table, ctx.resolutions), array(grads[0])
         if ctx.needs_input_grad[0]:
             to_points = torch.empty(len(points), 3)
             kernels.point_slopes(*given, to_points.view(-1).numpy())
-        if ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[1] and ctx.gradient is not None:
+            kernels.backward(*given, 1, array(ctx.gradient.gradient()))
+        elif ctx.needs_input_grad[1]:
             # A table of few scales gives few tasks, so a small one is summed up in parts. Sizes alone decide:
             # the order of the sums must not depend on the machine.
             slices = (
@@ -223,26 +275,33 @@ class _Lookup(torch.autograd.Function):
             parts = torch.zeros(slices, *table.shape)
             kernels.backward(*given, slices, parts.view(-1).numpy())
             to_table = parts.sum(0) if slices > 1 else parts[0]
-        return to_points, to_table, None
+        return to_points, to_table, None, None
 
 
 class _Variation(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+    def forward(
+        ctx: Any, table: Tensor, resolutions: tuple[int, ...], gradient: HeldGradient | None
+    ) -> Tensor:
         from . import triplane_kernels as kernels
 
         ctx.save_for_backward(table)
         ctx.resolutions = resolutions
+        ctx.gradient = gradient
         return torch.tensor(kernels.variation(*_laid_out(table, resolutions)), dtype=table.dtype)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None]:
         from . import triplane_kernels as kernels
 
         (table,) = ctx.saved_tensors
-        out = torch.empty_like(table, memory_format=torch.contiguous_format)
-        kernels.variation_gradient(*_laid_out(table, ctx.resolutions), float(grads[0]), out.view(-1).numpy())
-        return out, None
+        given = (*_laid_out(table, ctx.resolutions), float(grads[0]))
+        if ctx.gradient is not None:
+            kernels.variation_gradient(*given, array(ctx.gradient.gradient()))
+            return None, None, None
+        out = torch.zeros_like(table, memory_format=torch.contiguous_format)
+        kernels.variation_gradient(*given, out.view(-1).numpy())
+        return out, None, None
 
 
 def _laid_out(table: Tensor, resolutions: Sequence[int]) -> tuple[Any, ...]:

@@ -404,7 +404,7 @@ def variation(table, channels, sizes, starts):
 
 @traced
 def apart_from_neighbours(table, at, offsets, factor, out, count):
-    """out[at :] = factor (4 table[at :] - those at four offsets, west, east, north, south) for `count` numbers,
+    """out[at :] += factor (4 table[at :] - those at four offsets, west, east, north, south) for `count` numbers,
     whole vectors.
     """
     west, east, north, south = offsets
@@ -413,7 +413,8 @@ def apart_from_neighbours(table, at, offsets, factor, out, count):
         x = at + k
         beside = load(table, x - west, NARROW) + load(table, x + east, NARROW)
         above = load(table, x - north, NARROW) + load(table, x + south, NARROW)
-        store(out, x, narrow(factor, NARROW) * (4.0 * load(table, x, NARROW) - (beside + above)))
+        apart = 4.0 * load(table, x, NARROW) - (beside + above)
+        store(out, x, load(out, x, NARROW) + narrow(factor, NARROW) * apart)
         return held
 
     repeat(count, [splat(table, 0.0, NARROW)], step, by=NARROW)
@@ -421,7 +422,7 @@ def apart_from_neighbours(table, at, offsets, factor, out, count):
 
 @_jit
 def variation_gradient(table, channels, sizes, starts, scale, out):
-    """out = scale * d variation / d table: twice the differences to the four neighbours; a missing one is
+    """out += scale * d variation / d table: twice the differences to the four neighbours; a missing one is
     itself.
     """
     for s in range(len(sizes)):

@@ -20,9 +20,12 @@ from ..config import PASSES, OptimizerConfig, TrainConfig
 from ..datamanagers.batches import generator_of
 from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError
+from ..fields.planes import Planes
 from ..interfaces import DataManager, Figures, State
 from ..memory import free_memory
+from ..ops import adam
 from ..ops.backend import tf32
+from ..ops.triplane import HeldGradient
 from ..progress import Display
 from ..rendering.cameras import PixelRays
 from ..rendering.renderer import TrainingStep, render_rays
@@ -78,11 +81,12 @@ class FieldLearner(SceneLearner):
         self._device = device
         self.lead = lead
         self.model = (build_model(config, prepared.facts) if model is None else model).to(device)
-        adam = config.optimizer
-        betas = 0.9, adam.beta2
+        chosen = config.optimizer
+        betas = 0.9, chosen.beta2
         self.optimizer = torch.optim.Adam(
-            self.model.learned(), lr=adam.rate, betas=betas, eps=adam.eps, fused=True
+            self.model.learned(), lr=chosen.rate, betas=betas, eps=chosen.eps, fused=True
         )
+        self.held = hold_gradients(self.model)
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         # A mistake in the config is told before features are moved and steps are taken.
         check_penalties(config.loss, self.model)
@@ -162,11 +166,13 @@ class FieldLearner(SceneLearner):
                 generator=draws,
             )
             loss = total(self.config.loss, parts, share)
+        for each in self.held:
+            each.clear()
         self.optimizer.zero_grad(set_to_none=True)
         with record_function("fprf.backward"):
             loss.backward()  # type: ignore[no-untyped-call]
         # A loss or gradient that is not finite makes the norm so, and the device needs one comparison.
-        norm = torch.nn.utils.get_total_norm([p.grad for p in self.model.parameters() if p.grad is not None])
+        norm = adam.gradient_norm(self.model.parameters())
         unfit = (~(torch.isfinite(loss.detach()) & (norm < LARGEST))).float()
         with record_function("fprf.optimizer"):
             if self.device.type == "cuda":
@@ -175,6 +181,8 @@ class FieldLearner(SceneLearner):
                 self.optimizer.found_inf = unfit  # type: ignore[attr-defined]
                 self.optimizer.step()
             elif not bool(unfit):
+                for each in self.held:
+                    step_held(self.optimizer, each)
                 self.optimizer.step()
                 if (step + 1) % CLEAR_EVERY == 0:
                     clear_denormals(self.optimizer)
@@ -263,6 +271,38 @@ class Batches:
             return batch
         # From pinned memory copies to the device need not be waited for.
         return Batch._make(None if x is None else x.pin_memory() for x in batch)
+
+
+def hold_gradients(model: Model) -> list[HeldGradient]:
+    """Hold the gradients of large tables of planes between steps."""
+    found: list[HeldGradient] = []
+    for module in model.modules():
+        if isinstance(module, Planes):
+            gradient = module.hold_gradient()
+            if gradient is not None:
+                found.append(gradient)
+    return found
+
+
+@torch.no_grad()
+def step_held(optimizer: torch.optim.Adam, held: HeldGradient) -> None:
+    """Take Adam's step of a table by the kernel that also clears its gradient; the optimiser, which keeps the
+    moments, then finds no gradient of it. Where the kernel does not apply nothing changes.
+    """
+    table = held.table
+    (group,) = optimizer.param_groups
+    if table.grad is None or not adam.usable(table, table.grad, eps=group["eps"]):
+        return
+    state = optimizer.state[table]
+    if not state:
+        state["step"] = torch.zeros(())
+        state["exp_avg"] = torch.zeros_like(table)
+        state["exp_avg_sq"] = torch.zeros_like(table)
+    state["step"] += 1
+    beta1, beta2 = group["betas"]
+    by = adam.AdamStep(group["lr"], beta1, beta2, group["eps"], int(state["step"]))
+    adam.step(table, table.grad, adam.Moments(state["exp_avg"], state["exp_avg_sq"]), by)
+    table.grad = None
 
 
 def rate(config: OptimizerConfig, step: int, share: float) -> float:

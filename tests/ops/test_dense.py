@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.ops import backend
-from fprf.ops.dense import network, runs
+from fprf.ops.dense import network, runs, usable_in_training
 
 QUICK = settings(max_examples=25, deadline=None)
 U = 2.0**-24
@@ -112,3 +112,56 @@ def test_runs_of_equal_rows(values: list[float]) -> None:
     assert all(torch.equal(each, torch.arange(len(x))) for each in runs(x.double()))
     assert torch.equal(x[first][run].nan_to_num(7.0), x.nan_to_num(7.0))
     assert all(not torch.equal(x[a - 1], x[a]) for a in first.tolist() if a > 0)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "shared", "count", "biased"),
+    [
+        ((80, 64, 48), 16, 2001, False),
+        ((48, 128, 3), 0, 500, True),
+        ((12, 21, 5), 3, 101, True),
+        ((64, 32), 0, 7, True),
+    ],
+)
+def test_what_learns_has_the_gradients_of_float64(
+    sizes: tuple[int, ...], shared: int, count: int, biased: bool
+) -> None:
+    """Of inputs, of what points share, of weights and of biases, in both forms."""
+    weights, biases = layers_of(sizes, biased=biased)
+    x = draw(count, sizes[0] - shared)
+    side = draw(9, shared, seed=3)
+    row = torch.arange(count) * 9 // count
+    grad = draw(count, sizes[-1], seed=4)
+
+    def learnt(dtype: torch.dtype) -> list[Tensor]:
+        leaves = [
+            t.to(dtype).requires_grad_() for t in (x, side, *weights, *(b for b in biases if b is not None))
+        ]
+        maps = leaves[2 : 2 + len(weights)]
+        shifts = leaves[2 + len(weights) :] if biased else [None] * len(weights)
+        given = {"shared": leaves[1], "row": row} if shared else {}
+        found = network(leaves[0], maps, shifts, **given)
+        wanted = leaves if shared else [leaves[0], *leaves[2:]]
+        return [found.detach(), *torch.autograd.grad(found, wanted, grad.to(dtype))]
+
+    exact = learnt(torch.float64)
+    assert usable_in_training(x, *weights)
+    for form in (learnt, backend.plain()(learnt)):
+        for found, value in zip(form(torch.float32), exact, strict=True):
+            assert found.dtype == torch.float32
+            # A sum of n terms errs by n u of their magnitudes at most, by its root commonly; gates of ReLU
+            # that round to the other side are few.
+            assert (found.double() - value).norm() <= 2 * (count + sizes[0]) ** 0.5 * U * len(
+                sizes
+            ) * value.norm()
+
+
+def test_only_what_learns_gets_gradients() -> None:
+    weights, biases = layers_of((16, 32, 3))
+    x = draw(40, 16).requires_grad_()
+    network(x, weights, biases).sum().backward()
+    assert x.grad is not None and all(w.grad is None for w in weights)
+    still = draw(40, 16)
+    weights[1].requires_grad_()
+    network(still, weights, biases).sum().backward()
+    assert weights[1].grad is not None and weights[0].grad is None

@@ -110,6 +110,30 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+def test_held_gradients_are_added_by_kernels_and_cleared() -> None:
+    resolutions = (257, 5)
+    table = table_of(resolutions, 8).requires_grad_()
+    points = points_in_cells(500, 257)
+    held = triplane.held(table)
+    assert held is not None and triplane.held(table_of((5,), 8)) is None
+    wide = table.detach().double().requires_grad_()
+    exact = lookup_reference(points.double(), wide, resolutions).square().sum()
+    (exact + 3 * triplane.variation_reference(wide, resolutions)).backward()  # type: ignore[no-untyped-call]
+    assert wide.grad is not None
+    for _ in range(2):
+        found = lookup(points, table, resolutions, held).square().sum()
+        (found + 3 * variation(table, resolutions, held)).backward()  # type: ignore[no-untyped-call]
+        assert table.grad is not None and table.grad is held.gradient()
+        # Of a few points and four neighbours each number has a few terms.
+        assert (table.grad.double() - wide.grad).norm() <= 16 * U * wide.grad.norm()
+        # Plain forms add to the same memory.
+        lookup_reference(points, table, resolutions).square().sum().backward()  # type: ignore[no-untyped-call]
+        assert table.grad is held.gradient()
+        held.clear()
+        assert table.grad is None and not held.gradient().any()
+        held.clear()
+
+
 def points_in_cells(count: int, resolution: int, seed: int = 0) -> Tensor:
     """Inside of cells, at a quarter, half or three quarters of them: exact in float32 where cells are a power
     of two.

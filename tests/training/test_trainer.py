@@ -14,6 +14,7 @@ from torch import nn
 
 from fprf.config import TrainConfig
 from fprf.errors import CheckpointError, NumericsError
+from fprf.ops import backend, triplane
 from fprf.progress import Report
 from fprf.training import checkpoint
 from fprf.training.field_learner import CLEAR_EVERY, clear_denormals
@@ -192,6 +193,30 @@ def test_a_passing_fault_costs_the_steps_since_the_checkpoint_and_nothing_else(
     run = trained_for(world, folder, config, change=once)
     assert not left and len(events(run, "gone_back_to")) == 1
     assert same(parameters(run, 9), parameters(trained_for(world, tmp_path / "clean", config), 9))
+
+
+@pytest.mark.parametrize("bad", [[], [3]])
+def test_held_gradients_teach_what_plain_torch_does(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: list[int]
+) -> None:
+    """Also after a step that was skipped, whose gradients must not stay."""
+    monkeypatch.setattr(triplane, "_MAX_SLICED_NUMBERS", 0)
+    config = replace(world.config, steps=6)
+
+    def change(step: int, batch: Batch) -> Batch:
+        return spoilt(NAN, step)(step, batch) if step in bad else batch
+
+    held = trained_for(world, tmp_path / "held", config, change=change)
+    with backend.plain():
+        plain = trained_for(world, tmp_path / "plain", config, change=change)
+    ours = parameters(held, 6)
+    theirs = parameters(plain, 6)
+    assert ours.keys() == theirs.keys()
+    for name, value in theirs.items():
+        if name.endswith(".step"):
+            assert torch.equal(ours[name], value), "each step counts once"
+        else:
+            assert (ours[name].double() - value.double()).norm() <= 1e-3 * value.double().norm(), name
 
 
 def faded(steps: int, clear: bool) -> tuple[nn.Parameter, torch.optim.Optimizer]:
