@@ -42,6 +42,8 @@ class _ConfigFile(msgspec.Struct, forbid_unknown_fields=True):
     plugins: dict[str, str]
     """Name, package and version of what fills each slot."""
     config: object
+    schema: str = msgspec.field(name="$schema", default="")
+    """Where its schema is, for editors."""
 
 
 def save_config(path: Path, config: RunConfig, method: str) -> None:

@@ -3,8 +3,8 @@ its own flags, and files of the repository that pages link to.
 """
 
 import contextlib
-import importlib
 import io
+import json
 import logging
 import os
 import posixpath
@@ -15,7 +15,8 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from fprf.cli.main import VERBS, Verb
+from fprf.cli.config_schema import schema
+from fprf.cli.main import VERBS, Verb, verb_module
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = logging.getLogger("mkdocs.hooks.fprf")
@@ -39,13 +40,16 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds what does not lie in docs/."""
+    """Adds what does not lie in docs/: pages, schemas of files."""
     for source, page in FRONT.items():
         files.append(
             File.generated(config, page, content=moved((ROOT / source).read_text("utf-8"), source, page))
         )
     for verb, about in VERBS.items():
         files.append(File.generated(config, f"verbs/{verb}.md", content=verb_page(verb, about)))
+    for name in ("style", "keyframes", "config"):
+        text = json.dumps(schema(name), indent=1)
+        files.append(File.generated(config, f"schemas/{name}.schema.json", content=text))
     wanted = {path for file in list(files) if file.is_documentation_page() for path in linked(file)}
     for path in sorted(wanted - {file.src_uri for file in files}):
         source = ROOT / path.removeprefix("repository/")
@@ -119,7 +123,7 @@ def help_of(verb: str, words: list[str]) -> str:
     """What `--help` prints."""
     heard = io.StringIO()
     with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
-        importlib.import_module(f"fprf.cli.{verb}").run([*words, "--help"])
+        verb_module(verb).run([*words, "--help"])
     return heard.getvalue().strip()
 
 

@@ -8,52 +8,28 @@ Exit codes: 0 done, 1 our fault, 2 what the user can mend (a mistake, too little
 error), 130 interrupted, 141 where nobody reads the output any more.
 """
 
-import importlib
-import inspect
 import io
 import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from .. import __version__
-from ..errors import FprfError, UsageError
+from ..errors import FprfError
 from ..memory import keep_memory, out_of_memory, shortage
-from ..plugins.registry import installed, make, nearest
+from .verbs import VERBS as VERBS
+from .verbs import Verb as Verb
+from .verbs import packaged, run_packaged
+from .verbs import verb_module as verb_module
 
-_VERB_GROUP = "fprf.commands"
-"""Entry points of verbs of packages."""
+_COMPLETION = ("--complete", "--show-completion", "--install-completion")
+"""What shells ask, and what gives them their scripts."""
 _PIPE_CLOSED = 141
 """Exit status of a program that SIGPIPE ended."""
 _SPIN_ROUNDS = "1000"
 """Of a thread of GNU's OpenMP that waits for others: some 20 microseconds (the times are told in `_run`)."""
 _SPIN_MILLISECONDS = "0"
 """Of a thread of LLVM's OpenMP that waits for others."""
-
-
-class Verb(NamedTuple):
-    """A command's line in `fprf --help`; its code is `fprf.cli.NAME`, with `run(args) -> exit code`."""
-
-    usage: str
-    summary: str
-
-
-VERBS = {
-    "demo": Verb("[--output DIR]", "a garden, trained and restyled, as a page; no network, no data"),
-    "process": Verb("IMAGES|VIDEO --output SCENE", "find poses for images or a video that have none"),
-    "train": Verb("[METHOD|CONFIG.json] --data DIR", "train a scene, or go on where a run stopped"),
-    "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
-    "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
-    "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
-    "gallery": Verb("RUN --references DIR", "a run in every style, as one page to walk through"),
-    "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
-    "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
-    "export": Verb("RUN [ply splat glb cameras]", "points, splats, meshes, cameras as files"),
-    "pretrain": Verb("decoder", "train the decoder of an encoder"),
-    "plugins": Verb("[--check | new NAME]", "list what is installed, check that it loads, begin another"),
-    "doctor": Verb("[DIR|METHOD]", "look over this machine, a scene or a method's needs"),
-}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -116,6 +92,17 @@ def _run(args: list[str]) -> int:
     if args[0] == "--version":
         print(f"fprf {__version__}")
         return 0
+    if args[0] in _COMPLETION:
+        from . import completion
+
+        if args[0] == "--complete":
+            words = completion.complete(args[1:])
+            print("\n".join(words), end="\n" if words else "")
+        elif args[0] == "--show-completion":
+            print(completion.script("".join(args[1:2])), end="")
+        else:
+            print(completion.install("".join(args[1:2])))
+        return 0
     # OpenCV would tell damaged images a second time, beside our one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")
     # Threads that wait for others give way soon, unless the user decided otherwise. By default OpenMP's spin
@@ -129,29 +116,8 @@ def _run(args: list[str]) -> int:
     verb = args[0]
     rest = args[1:]
     if verb in VERBS:
-        return int(importlib.import_module(f".{verb}", __package__).run(rest))
-    # Verbs of packages are configs: their fields are the flags, their docstring is the help.
-    others = packaged()
-    if verb not in others:
-        known = [*VERBS, *others]
-        raise UsageError(f"fprf {verb}: no such verb{nearest(verb, known)} (verbs: {', '.join(known)})")
-    from .config import CommandConfig
-    from .parsing import parse
-
-    config = make(_VERB_GROUP, verb, CommandConfig)
-    about = inspect.getdoc(type(config)) or ""
-    return (
-        parse(config, rest, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
-    )
-
-
-def packaged() -> dict[str, str]:
-    """Verbs of packages: name to the packages that provide it. Imports nothing."""
-    found: dict[str, str] = {}
-    for name, entries in installed(_VERB_GROUP).items():
-        if name not in VERBS:
-            found[name] = " and ".join(each.package for each in entries)
-    return found
+        return int(verb_module(verb).run(rest))
+    return run_packaged(verb, rest)
 
 
 def _help() -> str:
@@ -180,5 +146,6 @@ def _help() -> str:
         *(f"  {bold}{name:<{width}}{plain}  {dim}of {package}{plain}" for name, package in others.items()),
         *([""] if others else []),
         "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
+        "`fprf --install-completion` lets the shell complete verbs, flags, plug-ins, runs and regions.",
     ]
     return "\n".join(lines)

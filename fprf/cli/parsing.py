@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 C = TypeVar("C")
 
+COMPLETING = "--fprf-complete"
+"""Among the arguments: `parse` raises Completing in the place of parsing them."""
 _MAX_HELP_COLUMNS = 100
 """Widest help text: a page, not a wide screen."""
 _TRUTHS = (["True"], ["False"], ["true"], ["false"])
@@ -39,6 +41,15 @@ _SCALARS = {
     Path: "a path",
     type(None): "none",
 }
+
+
+class Completing(Exception):
+    """The config whose flags a command line may have, for the completion of shells."""
+
+    def __init__(self, config: Any, positional: tuple[str, ...]) -> None:
+        super().__init__()
+        self.config = config
+        self.positional = positional
 
 
 class Flag(NamedTuple):
@@ -281,6 +292,8 @@ def parse(
     """
     # Slots first: what fills them decides which flags there are.
     config, rest = resolve(default, args)
+    if COMPLETING in rest:
+        raise Completing(config, positional)
     for slot in slots(config):
         if isinstance(slot.value, Missing):
             slot.value.build()

@@ -5,8 +5,9 @@
     {"format": 1, "style": {the fields of StyleConfig}, "sha256": {path: hash}, "semantic_encoder": identity,
      "regions": {name: [key in the encoder's own channels]}, "made": what a run measured}
 
-Only "format" and "style" must be there. Paths are relative to the file, or absolute. A region that the style
-names is found on another scene by its key, since numbers mean something on one scene alone.
+Only "format" and "style" must be there; "$schema" may name the file's schema, for editors (`fprf
+config-schema`). Paths are relative to the file, or absolute. A region that the style names is found on another
+scene by its key, since numbers mean something on one scene alone.
 
 `keys.json` says which frame has which style; between two of them one fades into the other.
 
@@ -39,7 +40,19 @@ from .config import NO_MASK, StyleConfig
 
 _STYLE_FORMAT = 1
 """Of style.json: counts up when an older fprf could not read it."""
-_STYLE_KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
+_SCHEMA_KEY = "$schema"
+"""Where a file's schema is, for editors (`fprf config-schema`)."""
+_STYLE_KEYS = (
+    _SCHEMA_KEY,
+    "format",
+    "fprf",
+    "plugins",
+    "style",
+    "sha256",
+    "semantic_encoder",
+    "regions",
+    "made",
+)
 
 RegionKey = tuple[float, ...]
 S = TypeVar("S", bound=StyleConfig)
@@ -306,7 +319,7 @@ def read_keyframes(path: Path) -> tuple[Keyframe, ...]:
     try:
         if (
             not isinstance(whole, dict)
-            or whole.keys() != {"format", "keyframes"}
+            or whole.keys() - {_SCHEMA_KEY} != {"format", "keyframes"}
             or whole["format"] != _STYLE_FORMAT
         ):
             raise ConfigError(

@@ -4,7 +4,6 @@ parsed to the end.
 A command that is neither stands in `ELSEWHERE` with the reason; nothing else is left out.
 """
 
-import importlib
 import json
 import os
 import re
@@ -26,7 +25,7 @@ from tiny_world import World, flags
 
 import fprf
 from fprf.cli import main as cli
-from fprf.cli.main import VERBS
+from fprf.cli.main import VERBS, verb_module
 from fprf.io.atomic import write_json
 from fprf.io.video import write_video
 from fprf.methods import fprf_splats
@@ -37,7 +36,7 @@ from fprf.training.driver import train
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-RUN = ("eval", "stylize", "restyle", "render", "gallery", "export", "plugins", "doctor")
+RUN = ("eval", "stylize", "restyle", "render", "gallery", "export", "plugins", "config-schema", "doctor")
 """Verbs whose commands are run here."""
 PARSED = {
     "demo": "minutes; tests/cli/test_scene_verbs.py runs it small",
@@ -184,7 +183,7 @@ def test_it_is_understood(place: Path, lines: list[list[str]], monkeypatch: pyte
 
 def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """The config that a verb would start with."""
-    module = importlib.import_module(f"fprf.cli.{words[1]}")
+    module = verb_module(words[1])
     real = module.parse
     heard = []
 
