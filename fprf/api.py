@@ -28,6 +28,7 @@ from .io.images import Picture, encode, to_uint8, write_image
 from .io.memory_pictures import Photograph, is_temporary, photograph_files
 from .io.overwriting import Origin
 from .io.paths import PathLike, as_path, as_paths
+from .light.config import SunConfig
 from .plugins.conversion import three_numbers
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
@@ -383,7 +384,7 @@ class FinishedCapture:
 
     def restyled(
         self,
-        references: Photograph | Sequence[Photograph],
+        references: Photograph | Sequence[Photograph] = (),
         *,
         weights: Sequence[float] = (),
         masks: PathLike | Sequence[PathLike] = (),
@@ -402,11 +403,12 @@ class FinishedCapture:
         at: float = 0.5,
         preset: str | None = None,
         match_light: bool = False,
+        sun: SunConfig | None = None,
     ) -> "FinishedCapture":
         """The capture, as it was read, in the style of photographs; arguments as those of `stylize` of a trained
-        scene. `match_light` takes exposure and white balance alone.
+        scene. `match_light` takes exposure and white balance alone; a `sun` may come with photographs or without.
 
-        Raises UsageError for no references, DataError for unreadable photographs and where nothing can be
+        Raises UsageError for neither, DataError for unreadable photographs and where nothing can be
         seen.
         """
         seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
@@ -430,9 +432,11 @@ class FinishedCapture:
         )
         if preset is not None:
             style = with_preset(style, preset)
+        if sun is not None:
+            style = replace(style, **vars(sun))
         styled = apply_style(seen().scene, StyleFile(style))
         styled = light_alone(styled) if match_light else styled
-        harmonics = seen().harmonics(0, self.capture, styled.restyle)
+        harmonics = seen().harmonics(0, self.capture, seen().scene.restyled(styled.restyle))
         return replace(self, harmonics=harmonics, seen=seen, references=style.references)
 
     def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "FinishedCapture":

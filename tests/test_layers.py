@@ -17,7 +17,7 @@ ROOT = Path(fprf.__file__).parent
 ORDER = (
     *("errors", "version", "types", "memory", "checks", "progress", "io", "interfaces", "scenes", "configs"),
     "outputs",
-    *("ops", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
+    *("ops", "light", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
     *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
     *("page", "api", "cli", "__main__"),
 )

@@ -230,7 +230,7 @@ def _write_captures(
         faulty = False
         for one, out in zip(made, files[number] if files else (), strict=False):
             display.count(done, steps, "restyling")
-            harmonics = seen.harmonics(number, capture, one.styled.restyle)
+            harmonics = seen.harmonics(number, capture, one.scene)
             written = write_capture(out.capture, capture, harmonics, seen.scene.views)
             write_style(out.style, one.styled.controls.saved)
             faulty = written.faulty
@@ -256,7 +256,7 @@ def _say_notes(config: RestyleConfig, made: Sequence[_Restyled]) -> None:
     for note in notes:
         print(note)
     if config.output is not None and not made:
-        print(f"--output {config.output}: no capture is written, since no --references are named")
+        print(f"--output {config.output}: no capture is written, since neither --references nor a light are named")
 
 
 def _explain(config: RestyleConfig, file: StyleFile, scene: "SplatScene", made: Sequence[_Restyled]) -> None:
@@ -312,9 +312,10 @@ def _outputs(config: RestyleConfig) -> tuple[RestyleConfig, list[Path]]:
         raise UsageError("fprf restyle: name what to write, with --output, --page or --explain")
     if config.page is not None and config.page.suffix.lower() != ".html":
         raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
-    if not config.references and not config.explain:
+    if not config.references and not config.lit and not config.explain:
         raise UsageError(
-            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg"
+            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg, or a "
+            "light, for example --light golden-hour"
         )
     captures = _with_folders(config.captures)
     several = len(captures) > 1 or captures != config.captures
@@ -565,7 +566,7 @@ def _names_of(stems: Iterable[str]) -> list[str]:
 def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with what is added to the names of their files."""
     if not config.each:
-        return [("", file)] if config.references else []
+        return [("", file)] if config.references or config.lit else []
     alone = []
     # Without dots: x.compressed would make another format of a .ply.
     names = _names_of(path.stem.replace(".", "_") for path in config.references)

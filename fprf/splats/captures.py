@@ -40,7 +40,8 @@ from .gaussians import Gaussians, bulk_of
 from .ground import USUAL_UP, Direction, axis_name, find_ground
 from .neighbours import Neighbours, sampled
 from .restyle import restyled_harmonics
-from .scene import SplatScene
+from .relighting import relit_harmonics
+from .scene import SplatScene, with_illumination
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
 from .views import find_views
 
@@ -138,7 +139,8 @@ def _scene_of(
     names = tuple(f"{view:02d}" for view in range(len(cameras)))
     longest = int(cameras.size.amax())
     near = clip_distance(gaussians)
-    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
+    scene = SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
+    return with_illumination(scene)
 
 
 def open_capture(
@@ -238,22 +240,31 @@ class Captures:
     count: int
     """Gaussians of all captures."""
 
-    def harmonics(self, index: int, capture: Capture, look: Restyle) -> Annotated[Tensor, "N K 3"]:
-        """Harmonics in a look of all Gaussians of capture number `index` that can be drawn."""
+    def harmonics(self, index: int, capture: Capture, styled: SplatScene) -> Annotated[Tensor, "N K 3"]:
+        """Harmonics of all Gaussians of capture number `index` that can be drawn, in the look of the scene of all
+        in a style.
+        """
+        look = styled.look
         gaussians = capture.gaussians
         rows = self.rows[index]
         finite = gaussians.finite
         if not bool(finite.all()):
             gaussians = gaussians.select(finite)
         means = gaussians.means + moved_origin(capture.origin, self.scene.origin)
+        if rows.stop - rows.start == len(gaussians):
+            return styled.styled_harmonics(replace(gaussians, means=means), rows)
+        if look is None:
+            return gaussians.harmonics
         features = self.scene.found().features[rows]
-        if len(features) == len(gaussians):
-            return restyled_harmonics(gaussians.harmonics, means, features, look)
         # The sample stands where its own capture was moved to: back in its place.
         near = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], features)
         out = torch.empty_like(gaussians.harmonics)
         for some in pieces(len(out)):
             out[some] = restyled_harmonics(gaussians.harmonics[some], means[some], near(means[some]), look)
+        if look.lit:
+            light = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], styled.light_gain[rows])
+            for some in pieces(len(out)):
+                out[some] = relit_harmonics(out[some], light(means[some]).float())
         return out
 
 

@@ -25,7 +25,7 @@ from .gaussians import Gaussians, from_tensors
 from .learner import Bounds, GaussianLearner, Stage, refined
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
-from .scene import SplatScene
+from .scene import SplatScene, with_illumination
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors
 from .view_corrections import ViewCorrections
 
@@ -153,7 +153,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         levels=functools.cache(levels),
         asked=device_of(device),
     )
-    return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, shown)
+    return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, with_illumination(shown))
 
 
 def fit_poses(

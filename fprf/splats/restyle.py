@@ -50,7 +50,7 @@ def restyled_harmonics(
     look: Restyle,
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics of Gaussians in a look. Those that it leaves alone (strength 0) stay, bit for bit."""
-    if look.idle:
+    if look.painted_nothing:
         return before
     out = torch.empty_like(before)
     kept = sum(part.share * part.luminance for part in look.parts)

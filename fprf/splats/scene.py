@@ -8,7 +8,7 @@ shows (`photographs`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Annotated
 
 import torch
@@ -30,6 +30,7 @@ from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
 from .pinholes import cover, distorted
+from .relighting import Illumination, find_illumination, mixed_gain, relit_harmonics
 from .restyle import ColourEncoder, restyled_harmonics
 from .semantics import Semantics
 
@@ -80,6 +81,8 @@ class SplatScene(Scene):
     """Fits poses of views to their photographs (`fit_poses`); None = there are no photographs."""
     asked: torch.device = CPU
     """Device to draw views on: the CPU, or a CUDA device if gsplat draws there."""
+    illumination: Callable[[], Illumination] | None = None
+    """What light needs to know: asked for when first needed; None = found by each scene that needs it."""
     copied: Gaussians | None = None
     """All Gaussians in the scene's look, where they are drawn, if another scene has them already."""
 
@@ -128,10 +131,29 @@ class SplatScene(Scene):
             gaussians = self.gaussians.select(rows)
         if self.look is None:
             return gaussians
-        features = self.found().features[rows]
-        return gaussians.recoloured(
-            restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look)
-        )
+        return gaussians.recoloured(self.styled_harmonics(gaussians, rows))
+
+    def styled_harmonics(self, gaussians: Gaussians, rows: slice | Tensor) -> Annotated[Tensor, "M K 3"]:
+        """Harmonics in the scene's look of some of its Gaussians."""
+        look = self.look
+        if look is None:
+            return gaussians.harmonics
+        harmonics = gaussians.harmonics
+        if not look.painted_nothing:
+            harmonics = restyled_harmonics(harmonics, gaussians.means, self.found().features[rows], look)
+        if look.lit:
+            harmonics = relit_harmonics(harmonics, self.light_gain[rows])
+        return harmonics
+
+    @cached_property
+    def light_gain(self) -> Annotated[Tensor, "N 3"]:
+        """Factors of colours + 0.055 in the light of the scene's look."""
+        assert self.look is not None  # by `styled_harmonics`
+        if self.illumination is None:
+            known = illuminated(self)
+        else:
+            known = self.illumination()
+        return mixed_gain(known, self.gaussians, self.look.lights)
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""
@@ -145,12 +167,7 @@ class SplatScene(Scene):
         look = self.look
         if look is None:
             return levels
-        features = self.found().features
-
-        def recolour(gaussians: Gaussians, index: Tensor) -> Tensor:
-            return restyled_harmonics(gaussians.harmonics, gaussians.means, features[index], look)
-
-        return StyledLevels(levels, recolour)
+        return StyledLevels(levels, self.styled_harmonics)
 
     @cached_property
     def seen(self) -> SeenMeans:
@@ -269,6 +286,18 @@ class SplatScene(Scene):
         """
         found = self.found()
         return Encoders(ColourEncoder(), self.encoder(), found.basis, found.style, longest=self.longest)
+
+
+def illuminated(scene: SplatScene) -> Illumination:
+    """What light needs to know of a scene, from its views."""
+    return find_illumination(
+        scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near
+    )
+
+
+def with_illumination(scene: SplatScene) -> SplatScene:
+    """The scene with what light needs to know, which is found once, when it is first asked for."""
+    return replace(scene, illumination=cache(lambda: illuminated(scene)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from ..checks import at_least, between
 from ..errors import ConfigError, UsageError
+from ..light.config import SunConfig
 from ..plugins import slots
 from ..plugins.conversion import convert_fields
 from ..plugins.registry import nearest
@@ -160,7 +161,7 @@ NO_MASK = Path("none")
 
 
 @dataclass(frozen=True, kw_only=True)
-class StyleConfig:
+class StyleConfig(SunConfig):
     """Controls of the style. REGION and REFERENCE are explained above."""
 
     references: tuple[Path, ...] = ()
@@ -209,6 +210,7 @@ class StyleConfig:
 
     def __post_init__(self) -> None:
         convert_fields(self)
+        SunConfig.__post_init__(self)
         for name in ("blend", "strength", "luminance", "bold", "at"):
             between(name, getattr(self, name), 0.0, 1.0)
         at_least("clusters", self.clusters, 1)

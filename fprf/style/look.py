@@ -28,6 +28,7 @@ from torch import Tensor, nn
 
 from ..checks import between
 from ..interfaces import Decoder, Stylizer
+from ..light.config import SunConfig
 from ..ops.backend import double
 from ..types import Want
 from .config import Place
@@ -397,6 +398,10 @@ class Restyle:
     """Stylizers and colours of places, for Gaussians alone, each over those before it; of these no other
     field counts.
     """
+    sun: SunConfig | None = None
+    """Light that falls on Gaussians once they have their colours, at any strength of these; None = the captured
+    one.
+    """
     others: tuple["Restyle", ...] = ()
     """The other parts of the mix, which have none themselves."""
 
@@ -408,7 +413,22 @@ class Restyle:
     @property
     def idle(self) -> bool:
         """It changes nothing: the renderer need not ask."""
+        return self.painted_nothing and not self.lit
+
+    @property
+    def painted_nothing(self) -> bool:
+        """Colours stay as they are, but for a light that may fall on them."""
         return all(part.strength == 0 for part in self.parts if part.share > 0)
+
+    @property
+    def lit(self) -> bool:
+        """Another light falls on the scene."""
+        return any(part.sun is not None for part in self.parts if part.share > 0)
+
+    @property
+    def lights(self) -> tuple[tuple[float, SunConfig | None], ...]:
+        """The lights of all parts with their shares; None = the captured one."""
+        return tuple((part.share, part.sun) for part in self.parts if part.share > 0)
 
     @property
     def needs(self) -> Want:
@@ -427,7 +447,8 @@ class Restyle:
     @property
     def faded(self) -> "Restyle":
         """The scene as it is, in the terms of this look: what it fades in from."""
-        return replace(self, strength=0.0, others=tuple(replace(part, strength=0.0) for part in self.others))
+        others = tuple(replace(part, strength=0.0, sun=None) for part in self.others)
+        return replace(self, strength=0.0, sun=None, others=others)
 
     def mixed(self, other: "Restyle", at: float) -> "Restyle":
         """The look on the way to another, which lies at 1. Raises ConfigError outside [0, 1]."""

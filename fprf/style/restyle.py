@@ -3,7 +3,7 @@ single regions.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -11,16 +11,17 @@ import torch
 from torch import Tensor
 
 from ..errors import ConfigError, UsageError
+from ..light.config import SunConfig
 from ..scenes import Scene
 from ..testing.outputs import check_stylizer
-from .config import NO_MASK, labels
+from .config import NO_MASK, StyleConfig, labels
 from .dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph
 from .files import Keyframe, StyleFile, check_photographs, fade, read_style, with_folders
 from .light import light_of
 from .look import Restyle, colour_maps, decoded_colours, region_maps, regional
 from .matching import unit
 from .regions import RegionControls, Regions, region_controls
-from .scene_style import RegionWeight, SceneStyle
+from .scene_style import RegionWeight, SceneStyle, own_style
 
 
 class Codes(NamedTuple):
@@ -60,15 +61,18 @@ def apply_style(
     unreadable photographs, WeightsError where the encoders are not the scene's.
     """
     style = with_folders(file.style)
-    if not style.references:
+    if not style.references and not style.lit:
         raise UsageError(
-            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg"
+            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg, or a "
+            "light, for example --light golden-hour"
         )
     # Photographs are encoded once, whatever name, weight or style they are used under.
     if encoders is None:
         encoders = scene.encoders()
     if encoded is None:
         encoded = {}
+    if not style.references:
+        return _light_alone(scene, file._replace(style=style), encoders)
     references = []
     for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True)):
         mask = NO_MASK
@@ -104,6 +108,10 @@ def apply_dictionary(
     scene does not have.
     """
     style = file.style
+    if style.lit and scene.decoder is not None:
+        raise UsageError(
+            "--sun, --light: light falls on Gaussians; write the fields as Gaussians first: fprf export RUN --gaussians OUT.ply"
+        )
     scene_style = encoders.scene_style
     basis = encoders.basis
     # Cosines that are not centred start from the encoder's zero, which the basis knows.
@@ -157,12 +165,36 @@ def apply_dictionary(
             features=config.features,
             colours=None if colours is None else colours.to(device),
             luminance=style.luminance,
+            sun=sun_of(style),
             light=None if light is None else light.to(device),
         )
 
     places = tuple((place.about(scene.origin), look(allowed)) for place, allowed in controls.places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene_style.semantic_mean))
     return Styled(replace(look(controls.allowed), places=places), dictionary, scene_style, codes, controls)
+
+
+def sun_of(style: StyleConfig) -> SunConfig | None:
+    """The light of a style; None = the captured one."""
+    if not style.lit:
+        return None
+    values = {}
+    for field in fields(SunConfig):
+        values[field.name] = getattr(style, field.name)
+    return SunConfig(**values)
+
+
+def _light_alone(scene: Scene, file: StyleFile, encoders: Encoders) -> Styled:
+    """A light on the scene's own colours, without photographs."""
+    style = file.style
+    still = file._replace(style=replace(style, strength=0.0))
+    own = own_style(encoders.scene_style, style.blend)
+    # Of Gaussians the content is the colour: the scene stands in the place of photographs of itself.
+    own = own._replace(colour_mean=own.mean, colour_covariance=own.covariance)
+    styled = apply_dictionary(scene, still, encoders, own)
+    saved = styled.controls.saved
+    saved = saved._replace(style=replace(saved.style, strength=style.strength))
+    return styled._replace(controls=styled.controls._replace(saved=saved))
 
 
 def mixed(a: Styled, b: Styled, at: float) -> Styled:

@@ -82,7 +82,7 @@ def test_a_sample_tells_the_colours_of_all(far: float, photograph: Path, tmp_pat
     style = StyleFile(StyleConfig(references=(photograph,), stylizer=RegionToneConfig(centred=False)))
     seen = open_captures([path], look(), sample=1000, cache=tmp_path / "cache")
     restyle = apply_style(seen.scene, style).restyle
-    found = seen.harmonics(0, seen.first, restyle)
+    found = seen.harmonics(0, seen.first, seen.scene.restyled(restyle))
     shown = seen.scene.restyled(restyle).shown
     assert len(found) == 3999 and len(shown) == 1000
     before = made.harmonics[seen.first.gaussians.finite]

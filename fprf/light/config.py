@@ -1,0 +1,71 @@
+"""Light that falls on a scene of Gaussians, as flags say it. No torch."""
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from ..checks import between
+from ..errors import ConfigError
+
+LightName = Literal["noon", "golden-hour", "blue-hour", "overcast", "moonlight"]
+MIN_KELVIN = 1667.0
+"""Lowest colour temperature that the formula for black bodies holds for."""
+MAX_KELVIN = 25000.0
+"""Highest one."""
+_HEX = re.compile(r"#?([0-9a-fA-F]{6})")
+_KELVIN = re.compile(r"(\d+(?:\.\d+)?)K?")
+
+Colour = tuple[float, float, float]
+
+
+def parse_light_colour(field: str, text: str) -> Colour | float:
+    """`#RRGGBB`, sRGB in [0, 1], or a colour temperature such as `3500` or `3500K`. Raises ConfigError."""
+    found = _KELVIN.fullmatch(text)
+    if found and not text.startswith("#") and float(found[1]) <= MAX_KELVIN:
+        between(field, float(found[1]), MIN_KELVIN, MAX_KELVIN)
+        return float(found[1])
+    found = _HEX.fullmatch(text)
+    if found is None:
+        raise ConfigError(f"{field}: {text!r} is no colour; write #RRGGBB or kelvin, for example #ffd9a0 or 3500K")
+    parts = []
+    for at in (0, 2, 4):
+        parts.append(int(found[1][at : at + 2], 16) / 255)
+    return (parts[0], parts[1], parts[2])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SunConfig:
+    """A sun and a sky, for Gaussians alone."""
+
+    light: LightName | None = None
+    """Light that falls on the scene in the place of the captured one, by a time of day; none = as captured, or
+    that of a clear sky where `sun` is given.
+    """
+    sun: tuple[float, float] | None = None
+    """AZIMUTH ELEVATION of the sun in degrees: clockwise from the direction of the first view, in [-360, 360],
+    and above the horizon, in (0, 90]. none = as the light says, if there is one.
+    """
+    sun_strength: float = 1.0
+    """How far this light takes the place of the captured one, in [0, 1]: at 0 colours stay bit for bit."""
+    sun_colour: str | None = None
+    """Colour of the sun: #RRGGBB, or kelvin such as 3500K. none = by its elevation."""
+    sky_colour: str | None = None
+    """Colour of the sky's light: #RRGGBB, or kelvin such as 9000K. none = as the light says."""
+    sun_size: float = 0.53
+    """Diameter of the sun in degrees, in [0, 5]: the larger, the softer are shadows far from what casts them."""
+
+    def __post_init__(self) -> None:
+        if self.sun is not None:
+            between("sun", self.sun[0], -360.0, 360.0)
+            between("sun", self.sun[1], 0.5, 90.0)
+        between("sun_strength", self.sun_strength, 0.0, 1.0)
+        between("sun_size", self.sun_size, 0.0, 5.0)
+        for name in ("sun_colour", "sky_colour"):
+            text = getattr(self, name)
+            if text is not None:
+                parse_light_colour(name, text)
+
+    @property
+    def lit(self) -> bool:
+        """A light other than the captured one is asked for."""
+        return (self.light is not None or self.sun is not None) and self.sun_strength > 0

@@ -1,0 +1,211 @@
+"""Another light on Gaussians: what is found out about them once, and their colours under a sun and a sky."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..light.config import SunConfig
+from ..light.relight import LINEAR_OFFSET, Received, affine_change, gains
+from ..light.sky import Light, light_of
+from ..light.surfaces import Surfaces, find_surfaces
+from ..light.transport import Blockers, covariances_of, frame_of, openness, transport
+from ..ops.harmonics import recoloured
+from ..rendering.cameras import Cameras
+from .gaussians import Gaussians, bulk_of
+from .pinholes import covering
+from .restyle import all_around
+
+_VIEWS = 16
+"""Views that surfaces are found in."""
+_VIEW_PIXELS = 320
+"""Longer side of these, at most."""
+_MAX_BLOCKER_DISTANCE = 0.5
+"""Distance from the bulk (`Bulk.apart`) up to which Gaussians cast shadows: skies and far surroundings lie
+farther out, four scenes from within have theirs at 0.6 and more (by eye).
+"""
+_OFFSET_SHARE = 0.008
+"""Distance of what casts shadows on a point from it, at least, as a share of the width of the views there: nearer
+ones are the surface itself. On the town 0.2 to 0.8 m do alike at 15 m.
+"""
+_LIFT_SHARE = 0.4
+"""Of that distance, by which points are moved out along their normals."""
+_BLUR_SHARE = 0.0008
+"""Deviation by which Gaussians are widened across the light, as a share of the same width at the median: thinner
+than a quarter of a pixel they would hit or miss.
+"""
+_SUN_RAYS = 8
+"""Rays to the disc of a sun that is larger than a degree."""
+_MIN_SKY_HEIGHT = 0.02
+"""Sine of the height above the middle of the cameras from which on what is far is sky (by eye)."""
+_MIN_SKY_COLOUR = 0.02
+"""Linear light that a captured sky has at least."""
+_MAX_SKY_GAIN = 4.0
+"""Of a sky's linear light (by eye)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Illumination:
+    """What light needs to know of N Gaussians, whatever its direction."""
+
+    surfaces: Surfaces
+    blockers: Blockers
+    openness: Annotated[Tensor, "N"]
+    far: Annotated[Tensor, "N"]
+    """Gaussians that neither cast shadows nor lie in them, bool."""
+    sky: Annotated[Tensor, "N"]
+    """Those of the sky, bool."""
+    heights: Annotated[Tensor, "N"]
+    """Sines of their heights above the horizon, as the cameras see them."""
+    up: Annotated[Tensor, "3"]
+    ahead: Annotated[Tensor, "3"]
+    """Level direction of the first view: azimuth 0."""
+
+    @property
+    def points(self) -> Annotated[Tensor, "N 1 3"]:
+        """Points just above the surfaces."""
+        away = _LIFT_SHARE * self.offset
+        return (self.surfaces.points + away[:, None] * self.surfaces.normals)[:, None]
+
+    @property
+    def offset(self) -> Annotated[Tensor, "N"]:
+        """Distance up to which what takes light away is the surface itself."""
+        return _OFFSET_SHARE * self.surfaces.widths
+
+    @property
+    def blur(self) -> float:
+        """Deviation by which blockers are widened."""
+        return _BLUR_SHARE * float(self.surfaces.widths.median())
+
+    def sun_direction(self, azimuth: float, elevation: float) -> Annotated[Tensor, "3"]:
+        """Unit vector to a sun at degrees clockwise from the first view's direction, and above the horizon."""
+        right = torch.linalg.cross(self.ahead, self.up)
+        turn = math.radians(azimuth)
+        rise = math.radians(elevation)
+        level = math.cos(turn) * self.ahead + math.sin(turn) * right
+        return math.cos(rise) * level + math.sin(rise) * self.up
+
+    def reach(self, sun: Annotated[Tensor, "3"], degrees: float = 0.0) -> Annotated[Tensor, "N"]:
+        """Share of the light of a sun of so many degrees that reaches each Gaussian, in [0, 1]."""
+        points = self.points
+        slopes = _disc(degrees)
+        if len(slopes) > 1:
+            points = points.expand(-1, len(slopes), -1)
+        frame = frame_of(sun, self.up)
+        offset = self.offset
+        found = transport(self.blockers, points, frame, offset, offset, slopes, self.blur)
+        return torch.where(self.far, torch.ones(()), found)
+
+    def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
+        """Factors of colours + 0.055 in a light."""
+        light, azimuth = light_of(config)
+        sun = self.sun_direction(azimuth, light.elevation)
+        reach = torch.zeros(len(gaussians))
+        if bool(light.sun.any()):
+            reach = self.reach(sun, config.sun_size)
+        received = Received(self.surfaces.normals, self.surfaces.sure, self.openness, reach)
+        weights = torch.where(self.sky, torch.zeros(()), self.surfaces.weights)
+        gain = gains(received, light, sun, self.up, gaussians.colours, weights)
+        if bool(self.sky.any()):
+            gain[self.sky] = self.sky_gain(gaussians, light)
+        return 1 + config.sun_strength * (gain - 1)
+
+    def sky_gain(self, gaussians: Gaussians, light: Light) -> Annotated[Tensor, "S 3"]:
+        """Factors of colours + 0.055 that give the captured sky, in the mean at each height, the light's own
+        colours.
+        """
+        height = self.heights[self.sky].clamp(0, 1)
+        linear = (gaussians.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
+        weight = (self.surfaces.weights[self.sky] + 1e-6)[:, None]
+        rows = torch.stack([torch.ones_like(height), height], 1)
+        fit = torch.linalg.lstsq((rows * weight.sqrt()).double(), (linear * weight.sqrt()).double()).solution
+        mean = (rows @ fit.float()).clamp_min(_MIN_SKY_COLOUR)
+        wanted = torch.lerp(light.horizon, light.zenith, height.sqrt()[:, None])
+        # The sky stays as bright as it is, but for what the light asks.
+        level = light.brightness * float((mean * weight).sum() / (3 * weight.sum()))
+        if bool(light.sun.any()):
+            level *= _CLEAR_SKY_SHARE
+        return (level * wanted / mean).clamp_max(_MAX_SKY_GAIN).pow(1 / 2.4)
+
+
+_CLEAR_SKY_SHARE = 0.55
+"""Brightness of a clear sky over that of clouds, in pictures that are exposed for what is lit (by eye)."""
+
+
+@torch.inference_mode()
+def find_illumination(
+    gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float
+) -> Illumination:
+    """Find surfaces, the sky and openness from views."""
+    up, ahead = world_axes(cameras)
+    shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
+    count = min(_VIEWS, len(cameras))
+    chosen = cameras.select(torch.linspace(0, len(cameras) - 1, count).round().long())
+    chosen = chosen.scaled(max(1.0, float(chosen.size.amax()) / _VIEW_PIXELS))
+    pinholes = [covering(chosen, view, near) for view in range(count)]
+    surfaces = find_surfaces(*shape, pinholes, up=up, antialiased=antialiased)
+    far = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart > _MAX_BLOCKER_DISTANCE)
+    eyes = cameras.pose[:, :, 3].float().mean(0)
+    heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ up
+    covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
+    blockers = Blockers(gaussians.means[~far], covariances[~far], gaussians.opacities[~far])
+    found = Illumination(
+        surfaces,
+        blockers,
+        torch.ones(len(gaussians)),
+        far,
+        far & (heights > _MIN_SKY_HEIGHT),
+        heights,
+        up,
+        ahead,
+    )
+    open_ = openness(
+        blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur
+    )
+    return Illumination(
+        surfaces, blockers, torch.where(far, torch.ones(()), open_), far, found.sky, heights, up, ahead
+    )
+
+
+def relit_harmonics(
+    harmonics: Annotated[Tensor, "N K 3"], gain: Annotated[Tensor, "N 3"]
+) -> Annotated[Tensor, "N K 3"]:
+    """Harmonics whose colours + 0.055 are multiplied, from every direction."""
+    weight = torch.ones(len(harmonics))
+    return recoloured(harmonics, affine_change(gain), weight, all_around(harmonics.shape[1]))
+
+
+def world_axes(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+    """Up, as cameras are held level, and the level direction of the first view; both of length 1."""
+    right = cameras.pose[:, :, 0].double()
+    # Held level, all have their x axes square to it; of views in one direction their own y axes tell it.
+    above = (cameras.pose[:, :, 1] + 0.5 * cameras.pose[:, :, 2]).double().mean(0)
+    moments = right.T @ right / len(right) - 1e-4 * torch.outer(above, above)
+    up = torch.linalg.eigh(moments)[1][:, 0]
+    up = up * (1.0 if float(up @ above) >= 0 else -1.0)
+    ahead = (cameras.pose[0, :, 1] - cameras.pose[0, :, 2]).double()
+    ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
+    return up.float(), ahead.float()
+
+
+def _disc(degrees: float) -> Annotated[Tensor, "K 2"]:
+    """Slopes of rays to a disc of so many degrees, evenly spread; one ray to a small one."""
+    if degrees <= 1.0:
+        return torch.zeros(1, 2)
+    at = torch.arange(_SUN_RAYS) + 0.5
+    radius = math.tan(math.radians(degrees / 2)) * (at / _SUN_RAYS).sqrt()
+    turn = at * (math.pi * (3 - 5**0.5))
+    return torch.stack([radius * turn.cos(), radius * turn.sin()], 1)
+
+
+def mixed_gain(
+    illumination: Illumination, gaussians: Gaussians, parts: Sequence[tuple[float, SunConfig | None]]
+) -> Annotated[Tensor, "N 3"]:
+    """The gain of lights that are mixed by shares; None is the captured one."""
+    total = torch.zeros(len(gaussians), 3)
+    for share, config in parts:
+        total += share * (1.0 if config is None else illumination.gain(gaussians, config))
+    return total
