@@ -99,6 +99,11 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
         "keep_below": [1.5],
         "region_strength": [("3=2",)],
         "pin": [("3",), ("box:1,2=0",)],
+        "sun": [(0.0, 0.0), (400.0, 30.0), (0.0, 91.0)],
+        "sun_strength": [1.5, -0.1],
+        "sun_size": [6.0],
+        "sun_colour": ["red"],
+        "sky_colour": ["800K"],
     },
     RestyleConfig: {"frames": [7], "seeds": [(1, 2)], "blend": [1.1], "palettes": [()], "longest": [8]},
 }

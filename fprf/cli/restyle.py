@@ -256,7 +256,9 @@ def _say_notes(config: RestyleConfig, made: Sequence[_Restyled]) -> None:
     for note in notes:
         print(note)
     if config.output is not None and not made:
-        print(f"--output {config.output}: no capture is written, since neither --references nor a light are named")
+        print(
+            f"--output {config.output}: no capture is written, since neither --references nor a light are named"
+        )
 
 
 def _explain(config: RestyleConfig, file: StyleFile, scene: "SplatScene", made: Sequence[_Restyled]) -> None:
@@ -312,7 +314,7 @@ def _outputs(config: RestyleConfig) -> tuple[RestyleConfig, list[Path]]:
         raise UsageError("fprf restyle: name what to write, with --output, --page or --explain")
     if config.page is not None and config.page.suffix.lower() != ".html":
         raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
-    if not config.references and not config.lit and not config.explain:
+    if not config.references and not config.light_asked and not config.explain:
         raise UsageError(
             "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg, or a "
             "light, for example --light golden-hour"
@@ -566,7 +568,7 @@ def _names_of(stems: Iterable[str]) -> list[str]:
 def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
     """The styles with what is added to the names of their files."""
     if not config.each:
-        return [("", file)] if config.references or config.lit else []
+        return [("", file)] if config.references or config.light_asked else []
     alone = []
     # Without dots: x.compressed would make another format of a .ply.
     names = _names_of(path.stem.replace(".", "_") for path in config.references)

@@ -26,7 +26,9 @@ def parse_light_colour(field: str, text: str) -> Colour | float:
         return float(found[1])
     found = _HEX.fullmatch(text)
     if found is None:
-        raise ConfigError(f"{field}: {text!r} is no colour; write #RRGGBB or kelvin, for example #ffd9a0 or 3500K")
+        raise ConfigError(
+            f"{field}: {text!r} is no colour; write #RRGGBB or kelvin, for example #ffd9a0 or 3500K"
+        )
     parts = []
     for at in (0, 2, 4):
         parts.append(int(found[1][at : at + 2], 16) / 255)
@@ -66,6 +68,11 @@ class SunConfig:
                 parse_light_colour(name, text)
 
     @property
+    def light_asked(self) -> bool:
+        """A light other than the captured one is asked for, at whatever strength."""
+        return self.light is not None or self.sun is not None
+
+    @property
     def lit(self) -> bool:
-        """A light other than the captured one is asked for."""
-        return (self.light is not None or self.sun is not None) and self.sun_strength > 0
+        """It changes colours."""
+        return self.light_asked and self.sun_strength > 0

@@ -59,12 +59,12 @@ def irradiance(
     return meets[:, None] * light.sun + opened * sky, meets
 
 
-def captured_irradiance(
-    received: Received, up: Annotated[Tensor, "3"]
-) -> Annotated[Tensor, "N 3"]:
+def captured_irradiance(received: Received, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "N 3"]:
     """The captured light, taken to be that of clouds or shade."""
     level = ((received.normals @ up + 1) / 2)[:, None]
-    return received.openness.clamp_min(_MIN_OPENNESS)[:, None] * (level + (1 - level) * _GROUND_ALBEDO).expand(-1, 3)
+    return received.openness.clamp_min(_MIN_OPENNESS)[:, None] * (
+        level + (1 - level) * _GROUND_ALBEDO
+    ).expand(-1, 3)
 
 
 def gains(

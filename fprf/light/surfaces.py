@@ -83,7 +83,8 @@ def find_surfaces(
         at = means - middle
         found = _view_surface(at, axes, shape, here, antialiased)
         pixels = torch.cat(
-            [found.normals, found.points, found.widths[..., None], torch.ones_like(found.widths)[..., None]], -1
+            [found.normals, found.points, found.widths[..., None], torch.ones_like(found.widths)[..., None]],
+            -1,
         )
         sums += lift(at, *shape, here, pixels.contiguous(), antialiased=antialiased)
     weight = sums[:, 7]
@@ -130,7 +131,9 @@ def _view_surface(
     deviation = (spread + inside[..., 2].square()) / _SURE_DEVIATION**2
     sure = drawn.opacity.square() / (1 + deviation).square()
     plane = torch.from_numpy(_fitted_planes(disparity.numpy(), sure.numpy()))
-    return _on_planes(plane, camera, float(1 / disparity[drawn.opacity > 0.5].median().clamp_min(1e-9)), world)
+    return _on_planes(
+        plane, camera, float(1 / disparity[drawn.opacity > 0.5].median().clamp_min(1e-9)), world
+    )
 
 
 def _on_planes(plane: Annotated[Tensor, "H W 3"], camera: Pinhole, usual: float, world: Tensor) -> _Map:
@@ -174,7 +177,8 @@ def _fitted_planes(disparity: _Pixels, sure: _Pixels) -> _Pixels:
         reach = max(1, round(radius * width / 320))
         size = (2 * reach + 1, 2 * reach + 1)
         one, two, three = (
-            cv2.blur(part.astype(np.float64), size, borderType=cv2.BORDER_CONSTANT) for part in (first, second, third)
+            cv2.blur(part.astype(np.float64), size, borderType=cv2.BORDER_CONSTANT)
+            for part in (first, second, third)
         )
         amount = np.maximum(one[..., 0], 1e-12)
         mx = one[..., 1] / amount

@@ -132,7 +132,7 @@ def transport(
         ids,
         rows,
         offset.float().contiguous().numpy(),
-        soft.float().contiguous().numpy(),
+        soft.float().clamp_min(1e-12).contiguous().numpy(),
         slopes.float().contiguous().numpy(),
         out,
     )
@@ -152,7 +152,10 @@ def sky_directions(up: Annotated[Tensor, "3"], count: int = _SKY_DIRECTIONS) -> 
     turn = at * (math.pi * (3 - 5**0.5))
     flat = (1 - height.square()).sqrt()
     across = frame_of(up)
-    return flat[:, None] * (turn.cos()[:, None] * across[0] + turn.sin()[:, None] * across[1]) + height[:, None] * across[2]
+    return (
+        flat[:, None] * (turn.cos()[:, None] * across[0] + turn.sin()[:, None] * across[1])
+        + height[:, None] * across[2]
+    )
 
 
 @torch.inference_mode()

@@ -29,7 +29,6 @@ from ..io.tensorfiles import load_sealed, save_kept
 from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
 from ..scenes import Scene
-from ..style.look import Restyle
 from ..training.loading import open_run
 from ..types import Origin
 from .config import LookConfig
@@ -39,8 +38,8 @@ from .files.base import pieces
 from .gaussians import Gaussians, bulk_of
 from .ground import USUAL_UP, Direction, axis_name, find_ground
 from .neighbours import Neighbours, sampled
-from .restyle import restyled_harmonics
 from .relighting import relit_harmonics
+from .restyle import restyled_harmonics
 from .scene import SplatScene, with_illumination
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
 from .views import find_views

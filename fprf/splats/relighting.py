@@ -86,7 +86,8 @@ class Illumination:
         turn = math.radians(azimuth)
         rise = math.radians(elevation)
         level = math.cos(turn) * self.ahead + math.sin(turn) * right
-        return math.cos(rise) * level + math.sin(rise) * self.up
+        sun: Tensor = math.cos(rise) * level + math.sin(rise) * self.up
+        return sun
 
     def reach(self, sun: Annotated[Tensor, "3"], degrees: float = 0.0) -> Annotated[Tensor, "N"]:
         """Share of the light of a sun of so many degrees that reaches each Gaussian, in [0, 1]."""
@@ -128,7 +129,8 @@ class Illumination:
         level = light.brightness * float((mean * weight).sum() / (3 * weight.sum()))
         if bool(light.sun.any()):
             level *= _CLEAR_SKY_SHARE
-        return (level * wanted / mean).clamp_max(_MAX_SKY_GAIN).pow(1 / 2.4)
+        gain: Tensor = (level * wanted / mean).clamp_max(_MAX_SKY_GAIN).pow(1 / 2.4)
+        return gain
 
 
 _CLEAR_SKY_SHARE = 0.55
@@ -162,9 +164,7 @@ def find_illumination(
         up,
         ahead,
     )
-    open_ = openness(
-        blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur
-    )
+    open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
     return Illumination(
         surfaces, blockers, torch.where(far, torch.ones(()), open_), far, found.sky, heights, up, ahead
     )

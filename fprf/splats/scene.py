@@ -290,9 +290,7 @@ class SplatScene(Scene):
 
 def illuminated(scene: SplatScene) -> Illumination:
     """What light needs to know of a scene, from its views."""
-    return find_illumination(
-        scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near
-    )
+    return find_illumination(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
 
 
 def with_illumination(scene: SplatScene) -> SplatScene:

@@ -61,7 +61,7 @@ def apply_style(
     unreadable photographs, WeightsError where the encoders are not the scene's.
     """
     style = with_folders(file.style)
-    if not style.references and not style.lit:
+    if not style.references and not style.light_asked:
         raise UsageError(
             "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg, or a "
             "light, for example --light golden-hour"
@@ -110,7 +110,7 @@ def apply_dictionary(
     style = file.style
     if style.lit and scene.decoder is not None:
         raise UsageError(
-            "--sun, --light: light falls on Gaussians; write the fields as Gaussians first: fprf export RUN --gaussians OUT.ply"
+            "--sun, --light: light falls on Gaussians; bring the fields into that form first, with fprf export RUN ply"
         )
     scene_style = encoders.scene_style
     basis = encoders.basis

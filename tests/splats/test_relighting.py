@@ -1,0 +1,149 @@
+"""Captures in another light: files, styles and mixes of lights."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from splat_ball import ball
+from tiny_world import World
+
+from fprf.api import FinishedCapture
+from fprf.cli import main as cli
+from fprf.errors import UsageError
+from fprf.light.config import SunConfig
+from fprf.plugins.encoders.config import RandomConfig
+from fprf.rendering.cameras import Cameras
+from fprf.rendering.paths import look_at, pinhole
+from fprf.splats.captures import look_at_capture
+from fprf.splats.config import LookConfig
+from fprf.splats.drawing import draw
+from fprf.splats.files import read_capture, write_gaussians
+from fprf.splats.gaussians import Gaussians
+from fprf.splats.pinholes import camera_of
+from fprf.splats.relighting import relit_harmonics, world_axes
+from fprf.splats.scene import SplatScene
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile, read_style, write_style
+from fprf.style.restyle import apply_style
+from fprf.training.loading import open_run
+
+SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
+NOON = SunConfig(light="noon", sun=(90.0, 40.0))
+
+
+@pytest.fixture(scope="module")
+def scene() -> SplatScene:
+    return look_at_capture(
+        ball(3000), False, RandomConfig().build(), LookConfig(views=6, size=(96, 72), regions=3)
+    )
+
+
+def lit(scene: SplatScene, config: SunConfig) -> SplatScene:
+    style = StyleConfig(**vars(config))
+    return scene.restyled(apply_style(scene, StyleFile(style)).restyle)
+
+
+def test_the_side_towards_the_sun_is_bright_and_the_other_dark(scene: SplatScene) -> None:
+    known = scene.illumination
+    assert known is not None
+    toward = known().sun_direction(90.0, 40.0)
+    gain = lit(scene, NOON).light_gain.mean(1)
+    facing = torch.nn.functional.normalize(scene.gaussians.means, dim=1) @ toward
+    shown = known().surfaces.weights > 1
+    assert float(gain[shown & (facing > 0.7)].mean()) > 1.5 * float(gain[shown & (facing < -0.3)].mean())
+
+
+def test_a_light_is_exact_on_harmonics_from_every_direction(scene: SplatScene) -> None:
+    gaussians = scene.gaussians
+    gain = 0.5 + torch.rand(len(gaussians), 3, generator=torch.Generator().manual_seed(0))
+    before = gaussians.harmonics.clone()
+    before[:, 0] = 0.0  # no colour below 0, which renderers cut
+    after = relit_harmonics(before, gain)
+    assert torch.allclose(after[:, 1:], before[:, 1:] * gain[:, None], atol=1e-5)
+
+
+def test_no_strength_is_the_file_bit_for_bit(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "in.ply", ball(300))
+    args = [str(tmp_path / "in.ply"), "--sun", "30", "40", *SMALL, "--cache", str(tmp_path / "cache")]
+    assert cli.main(["restyle", *args, "--sun-strength", "0", "--output", str(tmp_path / "no.ply")]) == 0
+    assert (tmp_path / "no.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+    capture = FinishedCapture(
+        read_capture(tmp_path / "in.ply"), LookConfig(views=4, size=(64, 48), regions=3)
+    )
+    assert cli.main(["restyle", *args, "--output", str(tmp_path / "lit.ply")]) == 0
+    changed = read_capture(tmp_path / "lit.ply").gaussians
+    assert torch.equal(changed.means, capture.gaussians.means)
+    assert not torch.equal(changed.harmonics, capture.gaussians.harmonics)
+    # The style file brings the same light.
+    style = read_style(tmp_path / "lit.style.json")
+    assert style.style.sun == (30.0, 40.0) and style.style.strength == 1.0
+    again = ["restyle", str(tmp_path / "in.ply"), "--style", str(tmp_path / "lit.style.json"), *SMALL]
+    assert (
+        cli.main([*again, "--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "again.ply")]) == 0
+    )
+    assert torch.equal(read_capture(tmp_path / "again.ply").gaussians.harmonics, changed.harmonics)
+    same = capture.restyled(sun=SunConfig(sun=(30.0, 40.0)))
+    assert torch.equal(same.gaussians.harmonics, changed.harmonics)
+
+
+def test_lights_fade_into_each_other(scene: SplatScene) -> None:
+    first = apply_style(scene, StyleFile(StyleConfig(light="noon"))).restyle
+    second = apply_style(scene, StyleFile(StyleConfig(light="moonlight"))).restyle
+    gains = [scene.restyled(look).light_gain for look in (first, second, first.mixed(second, 0.25))]
+    assert torch.allclose(gains[2], torch.lerp(gains[0], gains[1], 0.25), atol=1e-5)
+    half = scene.restyled(first.faded.mixed(first, 0.5)).light_gain
+    assert torch.allclose(half, (1 + gains[0]) / 2, atol=1e-5)
+    assert first.faded.idle and not first.idle
+
+
+def test_a_light_comes_over_the_colours_of_photographs(scene: SplatScene, photograph: Path) -> None:
+    photographs = StyleConfig(references=(photograph,))
+    plain = scene.restyled(apply_style(scene, StyleFile(photographs)).restyle).shown
+    both = scene.restyled(apply_style(scene, StyleFile(replace(photographs, light="noon"))).restyle)
+    wanted = relit_harmonics(plain.harmonics, both.light_gain)
+    assert torch.allclose(both.shown.harmonics, wanted, atol=1e-5)
+
+
+def test_a_style_file_keeps_lights(tmp_path: Path) -> None:
+    style = StyleConfig(
+        light="golden-hour", sun=(10.0, 12.0), sun_colour="3000K", sun_size=2.0, sun_strength=0.5
+    )
+    write_style(tmp_path / "style.json", StyleFile(style))
+    assert read_style(tmp_path / "style.json").style == style
+
+
+def test_up_and_ahead_are_those_of_level_cameras() -> None:
+    up = torch.nn.functional.normalize(torch.tensor([0.2, -0.9, 0.3]).double(), dim=0)
+    draw_ = torch.Generator().manual_seed(0)
+    eye = torch.randn(9, 3, generator=draw_).double()
+    cameras: Cameras = pinhole(look_at(eye, 0.1 * eye.flip(0), up), width=32, height=24, fov=60)
+    found, ahead = world_axes(cameras)
+    assert float(found.double() @ up) > 0.999
+    view = -cameras.pose[0, :, 2].double()
+    level = torch.nn.functional.normalize(view - (view @ up) * up, dim=0)
+    assert float(ahead.double() @ level) > 0.99
+    # Seen from above, the top of the picture is ahead.
+    flat = torch.cat([torch.randn(9, 2, generator=draw_), torch.full((9, 1), 5.0)], 1).double()
+    poses = torch.zeros(9, 3, 4).double()
+    turn = torch.randn(9, generator=draw_).double()
+    poses[:, 0, 0] = poses[:, 1, 1] = turn.cos()
+    poses[:, 1, 0] = turn.sin()
+    poses[:, 0, 1] = -turn.sin()
+    poses[:, 2, 2] = 1.0
+    poses[:, :, 3] = flat
+    found, ahead = world_axes(replace(cameras, pose=poses))
+    assert float(found[2]) > 0.99 and float(ahead.double() @ poses[0, :, 1]) > 0.99
+
+
+def test_a_capture_looks_alike_after_its_file_was_read_again(tmp_path: Path, scene: SplatScene) -> None:
+    shown: Gaussians = lit(scene, NOON).shown
+    write_gaussians(tmp_path / "lit.ply", shown)
+    read = read_capture(tmp_path / "lit.ply").gaussians
+    camera = camera_of(scene.views, 0)
+    assert torch.allclose(draw(read, camera).image, draw(shown, camera).image, atol=1e-5)
+
+
+def test_fields_are_told_to_become_gaussians(world: World) -> None:
+    with pytest.raises(UsageError, match="fprf export"):
+        apply_style(open_run(world.run, device="cpu").scene, StyleFile(StyleConfig(light="noon")))
