@@ -28,7 +28,7 @@ from .io.images import Picture, encode, to_uint8, write_image
 from .io.memory_pictures import Photograph, is_temporary, photograph_files
 from .io.overwriting import Origin
 from .io.paths import PathLike, as_path, as_paths
-from .light.config import SunConfig
+from .light.config import LightName
 from .plugins.conversion import three_numbers
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
@@ -180,7 +180,7 @@ class TrainedScene:
 
     def stylize(
         self,
-        references: Photograph | Sequence[Photograph],
+        references: Photograph | Sequence[Photograph] = (),
         *,
         weights: Sequence[float] = (),
         masks: PathLike | Sequence[PathLike] = (),
@@ -197,10 +197,17 @@ class TrainedScene:
         keep_below: float | None = None,
         between: PathLike | None = None,
         at: float = 0.5,
+        light: LightName | None = None,
+        sun: tuple[float, float] | None = None,
+        sun_strength: float = 1.0,
+        sun_colour: str | None = None,
+        sky_colour: str | None = None,
+        sun_size: float = 0.53,
         preset: str | None = None,
     ) -> "TrainedScene":
         """The scene in the style of one photograph or several, or of all in a folder: files, pictures of Pillow or
-        arrays. All arguments but `preset` are fields of `StyleConfig`, which explains them.
+        arrays. All arguments but `preset` are fields of `StyleConfig`, which explains them; under a
+        `light` or a `sun` Gaussians need no photographs.
 
         A preset, such as "gentle", replaces what it sets (`fprf.style.config.PRESETS`).
 
@@ -224,8 +231,16 @@ class TrainedScene:
             keep_below=keep_below,
             between=None if between is None else as_path(between),
             at=at,
+            light=light,
+            sun=sun,
+            sun_strength=sun_strength,
+            sun_colour=sun_colour,
+            sky_colour=sky_colour,
+            sun_size=sun_size,
         )
-        return self.apply(style if preset is None else with_preset(style, preset))
+        if preset is not None:
+            style = with_preset(style, preset)
+        return self.apply(style)
 
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
         """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as
@@ -401,12 +416,17 @@ class FinishedCapture:
         keep_below: float | None = None,
         between: PathLike | None = None,
         at: float = 0.5,
+        light: LightName | None = None,
+        sun: tuple[float, float] | None = None,
+        sun_strength: float = 1.0,
+        sun_colour: str | None = None,
+        sky_colour: str | None = None,
+        sun_size: float = 0.53,
         preset: str | None = None,
         match_light: bool = False,
-        sun: SunConfig | None = None,
     ) -> "FinishedCapture":
         """The capture, as it was read, in the style of photographs; arguments as those of `stylize` of a trained
-        scene. `match_light` takes exposure and white balance alone; a `sun` may come with photographs or without.
+        scene. `match_light` takes exposure and white balance alone; a `light` or a `sun` needs no photographs.
 
         Raises UsageError for neither, DataError for unreadable photographs and where nothing can be
         seen.
@@ -429,11 +449,15 @@ class FinishedCapture:
             keep_below=keep_below,
             between=None if between is None else as_path(between),
             at=at,
+            light=light,
+            sun=sun,
+            sun_strength=sun_strength,
+            sun_colour=sun_colour,
+            sky_colour=sky_colour,
+            sun_size=sun_size,
         )
         if preset is not None:
             style = with_preset(style, preset)
-        if sun is not None:
-            style = replace(style, **vars(sun))
         styled = apply_style(seen().scene, StyleFile(style))
         styled = light_alone(styled) if match_light else styled
         harmonics = seen().harmonics(0, self.capture, seen().scene.restyled(styled.restyle))

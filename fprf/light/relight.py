@@ -22,14 +22,17 @@ from .sky import Light
 LINEAR_OFFSET = 0.055
 """Added to sRGB, it is a power of linear light."""
 _POWER = 1 / 2.4
+"""Of linear light, which gives sRGB + 0.055 but for a factor."""
 _GROUND_ALBEDO = 0.25
 """Share of light that the ground sends back (grass 0.25, asphalt 0.12, concrete 0.4)."""
 _MIN_OPENNESS = 0.15
 """Share of the sky's light that the darkest corner has: light bounces (by eye)."""
 _MAX_GAIN = 2.2
 """Of c + 0.055: more would show what the capture has of noise in its shade (by eye)."""
-_MIN_LUMA = 1e-3
+_MIN_RATIO = 1e-3
+"""Of lights, so that powers are finite."""
 _LUMA = (0.2126, 0.7152, 0.0722)
+"""Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 
 
 class Received(NamedTuple):
@@ -86,7 +89,7 @@ def gains(
     before = float((lit * (linear @ luma)).sum())
     after = float((lit * ((linear * ratio) @ luma)).sum())
     exposure = light.brightness * before / after if after > 0 else 1.0
-    return (exposure * ratio).clamp_min(_MIN_LUMA).pow(_POWER).clamp_max(_MAX_GAIN)
+    return (exposure * ratio).clamp_min(_MIN_RATIO).pow(_POWER).clamp_max(_MAX_GAIN)
 
 
 def affine_change(gain: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 4 3"]:

@@ -18,6 +18,7 @@ from .config import Colour, SunConfig, parse_light_colour
 _WAVELENGTHS = (0.61, 0.55, 0.465)
 """Micrometres that red, green and blue stand for."""
 _SUN_KELVIN = 5778.0
+"""Of the sun above the air."""
 _TURBIDITY = 2.5
 """Of clear air, as in Preetham's."""
 _CLEAR_KELVIN = 12000.0
@@ -125,6 +126,7 @@ _USUAL_SUNS = {
 }
 """Azimuth and elevation of each light, where no sun is given."""
 _LUMA = torch.tensor([0.2126, 0.7152, 0.0722])
+"""Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 
 
 def _luma(colour: Annotated[Tensor, "3"]) -> float:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..ops.threads import on_threads
-from ..ops.transport_kernels import COLUMNS, count, fill, project, reach
+from ..ops.transport_kernels import COLUMNS, Lists, Receivers, Widths, count, fill, project, reach
 
 _MAX_COLUMNS = 256
 """Cells of the grid across the light, a side, at most: more lists than that take longer to write than to read."""
@@ -93,17 +93,9 @@ def transport(
     rows = np.empty((len(means), COLUMNS), np.float32)
     spread = float(slopes.norm(dim=1).max())
     floor = float(place[..., 2].min()) if len(place) else 0.0
-    on_threads(
-        project,
-        means,
-        blockers.covariances.contiguous().numpy(),
-        blockers.opacities.contiguous().numpy(),
-        np.ascontiguousarray(turn),
-        np.float32(blur**2),
-        np.float32(spread),
-        np.float32(floor),
-        rows,
-    )
+    gaussians = (means, blockers.covariances.contiguous().numpy(), blockers.opacities.contiguous().numpy())
+    widths = Widths(np.float32(blur**2), np.float32(spread), np.float32(floor))
+    on_threads(project, gaussians, np.ascontiguousarray(turn), widths, rows)
     rows = rows[rows[:, 10] >= 0]
     rows = rows[np.argsort(-rows[:, 9], kind="stable")]
     # Lines of the grid lie where the points are: the same number between any two of them.
@@ -121,21 +113,15 @@ def transport(
     ids = np.empty(starts[-1], np.int32)
     fill(ranges, columns, starts[:-1].copy(), ids)
     cells = np.searchsorted(lines[1], place[..., 1]) * columns + np.searchsorted(lines[0], place[..., 0])
-    order = np.argsort(cells[:, 0], kind="stable")
-    out = np.empty(len(place), np.float32)
-    on_threads(
-        reach,
-        order,
+    receivers = Receivers(
+        np.argsort(cells[:, 0], kind="stable"),
         place,
         cells.astype(np.int32),
-        starts,
-        ids,
-        rows,
         offset.float().contiguous().numpy(),
         soft.float().clamp_min(1e-12).contiguous().numpy(),
-        slopes.float().contiguous().numpy(),
-        out,
     )
+    out = np.empty(len(place), np.float32)
+    on_threads(reach, receivers, Lists(starts, ids, rows), slopes.float().contiguous().numpy(), out)
     return torch.from_numpy(out)
 
 

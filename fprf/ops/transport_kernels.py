@@ -13,8 +13,10 @@ on. A list ends where the rest lies below the point.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .threads import cached_jit, take
 
@@ -30,13 +32,48 @@ _BLOCK = 1024
 """Gaussians or points that a thread takes at a time."""
 
 
-@cached_jit(nogil=True)
-def project(counters, means, covariances, opacities, frame, blur, spread, floor, out):
-    """Gaussians [N 3] with covariances xx xy xz yy yz zz [N 6] in the frame [3 3], whose last row leads to the
-    light.
+class Widths(NamedTuple):
+    """How Gaussians are widened across the light."""
 
-    `spread` widens extents by so much for each unit of height above `floor`.
-    """
+    blur: np.float32
+    """Variance that is added."""
+    spread: np.float32
+    """What extents grow by for each unit of height above `floor`."""
+    floor: np.float32
+
+
+class Receivers(NamedTuple):
+    """Points that receive light, in its frame."""
+
+    order: NDArray[np.int64]
+    """Numbers of the points, cell by cell."""
+    points: NDArray[np.float32]
+    """x y h of the K rays to each [M K 3]."""
+    cells: NDArray[np.int32]
+    """Cell of each ray [M K]."""
+    offset: NDArray[np.float32]
+    """Height above the point up to which Gaussians count nothing [M]."""
+    soft: NDArray[np.float32]
+    """Further height from which on they count in full [M]."""
+
+
+class Lists(NamedTuple):
+    """Gaussians in each cell, from the highest on."""
+
+    starts: NDArray[np.int64]
+    """Where the list of each cell begins, and the last one ends [cells + 1]."""
+    ids: NDArray[np.int32]
+    rows: NDArray[np.float32]
+    """The Gaussians [N COLUMNS]."""
+
+
+@cached_jit(nogil=True)
+def project(counters, gaussians, frame, widths, out):
+    """Gaussians in the frame [3 3], whose last row leads to the light."""
+    means, covariances, opacities = gaussians
+    blur = widths.blur
+    spread = widths.spread
+    floor = widths.floor
     count = len(means)
     while True:
         start = take(counters, 0) * _BLOCK
@@ -108,12 +145,16 @@ def fill(ranges, columns, places, ids):
 
 
 @cached_jit(nogil=True, fastmath={"contract", "arcp"})
-def reach(counters, order, points, cells, starts, ids, rows, offset, soft, slopes, out):
-    """Share of light [M] that reaches points [M K 3] (x y h) in cells [M K], the mean over K rays.
-
-    A Gaussian counts where the ray meets it `offset` [M] and more above the point, fully from `offset` + `soft`
-    [M] on. `slopes` [K 2] are those of the rays.
-    """
+def reach(counters, receivers, lists, slopes, out):
+    """Share of light [M] that reaches points, the mean over K rays of slopes [K 2]."""
+    order = receivers.order
+    points = receivers.points
+    cells = receivers.cells
+    offset = receivers.offset
+    soft = receivers.soft
+    starts = lists.starts
+    ids = lists.ids
+    rows = lists.rows
     total = len(order)
     rays = points.shape[1]
     while True:

@@ -83,8 +83,25 @@ def test_no_strength_is_the_file_bit_for_bit(tmp_path: Path) -> None:
         cli.main([*again, "--cache", str(tmp_path / "cache"), "--output", str(tmp_path / "again.ply")]) == 0
     )
     assert torch.equal(read_capture(tmp_path / "again.ply").gaussians.harmonics, changed.harmonics)
-    same = capture.restyled(sun=SunConfig(sun=(30.0, 40.0)))
+    same = capture.restyled(sun=(30.0, 40.0))
     assert torch.equal(same.gaussians.harmonics, changed.harmonics)
+
+
+SECOND: dict[str, object] = {
+    "light": "moonlight",
+    "sun": (-60.0, 20.0),
+    "sun_strength": 0.5,
+    "sun_colour": "3000K",
+    "sky_colour": "#4080ff",
+    "sun_size": 5.0,
+}
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_a_second_value_changes_the_light(scene: SplatScene, name: str) -> None:
+    assert SECOND.keys() == vars(SunConfig()).keys()
+    other = replace(NOON, **{name: SECOND[name]})  # type: ignore[arg-type]
+    assert float((lit(scene, other).light_gain - lit(scene, NOON).light_gain).abs().max()) > 1e-3
 
 
 def test_lights_fade_into_each_other(scene: SplatScene) -> None:

@@ -13,6 +13,7 @@ from style_cases import region_adain
 from tiny_world import World
 
 from fprf.errors import ConfigError
+from fprf.light.config import SunConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.rendering.cameras import pixel_grid
 from fprf.style.config import NO_MASK, StyleConfig
@@ -63,7 +64,10 @@ def bench(_world: World) -> Bench:
 
 
 def test_every_field_has_a_second_value() -> None:
-    assert {field.name for field in fields(StyleConfig)} == {*SECOND, "references", "masks", "between", "at"}
+    # Lights are for Gaussians: tests/splats/test_relighting.py.
+    lights = {field.name for field in fields(SunConfig)}
+    others = {*SECOND, *lights, "references", "masks", "between", "at"}
+    assert {field.name for field in fields(StyleConfig)} == others
 
 
 @pytest.mark.parametrize("name", SECOND)

@@ -57,6 +57,12 @@ def full(folder: Path) -> StyleFile:
         keep_below=-0.25,
         between=photo(folder / "other" / "style.json"),
         at=0.75,
+        light="golden-hour",
+        sun=(30.0, 12.5),
+        sun_strength=0.5,
+        sun_colour="3000K",
+        sky_colour="#4080ff",
+        sun_size=2.0,
     )
     return StyleFile(style, {"sky": (0.5, -1.25), "region3": (1e-9, 7.0)}, "bundled-semantic:123")
 
