@@ -29,10 +29,10 @@ class Camera {
     return new Float32Array([r[0], d[0], f[0], 0, r[1], d[1], f[1], 0, r[2], d[2], f[2], 0, -dot(r, p), -dot(d, p), -dot(f, p), 1]);
   }
 
-  // fx fy cx cy for a canvas on which all of the photograph is to be seen: above a strip of so many pixels (`below`) and, the more
+  // fx fy cx cy for a canvas on which all of the photograph is to be seen: above a strip of such a share (`below`) and, the more
   // it `fills`, the larger and the less of it: from 0 to 1, where nothing is seen but the photograph.
   fitted(width, height, { below = 0, fills = 0 } = {}) {
-    const [w, h] = this.size, free = Math.max(height - below, height / 2), [fx, fy, cx, cy] = this.lens;
+    const [w, h] = this.size, free = height * Math.max(1 - below, 0.5), [fx, fy, cx, cy] = this.lens;
     const by = Math.min(width / w, free / h) ** (1 - fills) * Math.max(width / w, free / h) ** fills;
     return [fx * by, fy * by, width / 2 + (cx - w / 2) * by, free / 2 + (cy - h / 2) * by];
   }
@@ -96,7 +96,7 @@ class Place {
     const box = this.canvas.getBoundingClientRect(), by = Math.min(window.devicePixelRatio || 1, 2, EDGE / Math.max(box.width, box.height, 1));
     const size = [box.width, box.height].map((side) => Math.max(1, Math.round(side * by)));
     const bar = this.canvas.parentElement.querySelector(".bar")?.getBoundingClientRect(); // styles lie over the stage
-    const below = bar?.height ? by * Math.max(0, box.bottom - bar.top) : 0;
+    const below = bar?.height && box.height ? Math.max(0, box.bottom - bar.top) / box.height : 0;
     if (below !== this.below) { this.below = below; this.touch(); }
     if (size[0] === this.canvas.width && size[1] === this.canvas.height) return;
     [this.canvas.width, this.canvas.height] = size;
