@@ -120,7 +120,7 @@ def run(args: list[str]) -> int:
                 f"--references: {len(config.references)} photographs; the shelf takes {SHELF}: name fewer"
             )
         print(server.address, flush=True)
-        load = functools.partial(_load, config, server.notify)
+        load = functools.partial(_load, config, server.wait)
         try:
             if path is None:
                 from ..page.start import Start
@@ -148,7 +148,12 @@ def run(args: list[str]) -> int:
     return 0
 
 
-def _load(config: ViewConfig, notify: Callable[[str], None], path: Path, name: str | None = None) -> "Viewed":
+def _load(
+    config: ViewConfig,
+    wait: "Callable[[str, str, float | None], None]",
+    path: Path,
+    name: str | None = None,
+) -> "Viewed":
     """The scene of a run or a capture, under its own name where none is given."""
     from ..page.session import Viewed, view_of_run
     from ..page.uploads import is_capture
@@ -165,15 +170,17 @@ def _load(config: ViewConfig, notify: Callable[[str], None], path: Path, name: s
     from ..splats.files import read_capture
 
     def progress(done: int, total: int) -> None:
-        if done == 0:
-            notify("looking at the capture, once; a photograph can be dropped already")
+        words = f"Looking at {path.name}, once: {done} of {total}"
+        wait("looking", "" if done >= total else words, done / max(1, total))
 
+    wait("opening", f"Reading {path.name}", None)
     capture = read_capture(path, activated=config.activated)
     for note in capture.notes:
         say(f"{capture.path}: {note}")
     look = LookConfig(
         up=config.up, inside=config.inside, activated=config.activated, semantic=config.semantic
     )
+    wait("opening", f"{path.name}: finding places to look at {len(capture.gaussians):,} Gaussians from", None)
     scene = open_capture(capture, look, progress=progress, say=say)
     name = name or path.resolve().name.partition(".")[0]
     style = StyleConfig(stylizer=config.stylizer or RegionToneConfig(centred=False))

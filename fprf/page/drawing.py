@@ -333,15 +333,24 @@ class ScenePainter:
 
 def picture_of(scene: Scene, cameras: Cameras, look: Restyle | None, wipe: float) -> Steps[Picture]:
     """Render the first view in a look, and left of `wipe`, a share of its width, as captured; a step each strip."""
-    rows = []
     border = round(max(0.0, wipe) * int(cameras.size[0, 0]))
+
+    def wiped(shown: Tensor, captured: Callable[[], Tensor]) -> Tensor:
+        return torch.cat([captured()[:, :border], shown[:, border:]], 1) if border else shown
+
+    if isinstance(scene, SplatScene):
+        yield
+        whole = scene.restyled(look).render(cameras, 0).rgb
+        return to_uint8(wiped(whole, lambda: scene.render(cameras, 0).rgb))
+    rows = []
     for strip in _strips(scene, cameras):
-        shown = strip.restyled(look).rgb
-        if border:
-            shown = torch.cat([strip.restyled().rgb[:, :border], shown[:, border:]], 1)
-        rows.append(shown)
+        rows.append(wiped(strip.restyled(look).rgb, partial(_captured, strip)))
         yield
     return to_uint8(torch.cat(rows))
+
+
+def _captured(strip: SceneView) -> Annotated[Tensor, "h W 3"]:
+    return strip.restyled().rgb
 
 
 def rules_of(restyler: Restyler, file: StyleFile, photographs: Sequence[Photograph]) -> frozenset[RegionRule]:

@@ -153,6 +153,25 @@ class New(Message, tag="new"):
     name: Annotated[str, Meta(max_length=1000)] = ""
 
 
+class Discard(Message, tag="discard"):
+    """The files that came for a scene are not wanted after all."""
+
+    scene: Text
+
+
+class Rename(Message, tag="rename"):
+    """A scene of the list gets another name."""
+
+    scene: Text
+    name: Annotated[str, Meta(min_length=1, max_length=80)]
+
+
+class Remove(Message, tag="remove"):
+    """A scene of the list is deleted, with all that was made of it."""
+
+    scene: Text
+
+
 class Make(Message, tag="make"):
     """A scene is to be made of the files that came."""
 
@@ -175,7 +194,7 @@ class Leave(Message, tag="leave"):
     """The scene that is shown, or made, is to be closed."""
 
 
-StartRequest: TypeAlias = New | Make | Open | Stop | Leave
+StartRequest: TypeAlias = New | Discard | Make | Open | Rename | Remove | Stop | Leave
 _KINDS: tuple[Any, ...] = (AnyMessage, StartRequest, PictureRequest)
 _decoders: dict[Any, Any] = {kinds: msgspec.json.Decoder(kinds) for kinds in _KINDS}
 

@@ -62,6 +62,8 @@ _MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
 _MAX_QUERY_FIELDS = 16
 """Fields of an address; the page sends four."""
+_PREVIEW_PIXELS = 320
+"""Longest side of a picture in the list of scenes; by eye."""
 _SENT_BYTES = 1 << 16
 """Bytes of a piece of a response, which has to be accepted in time."""
 _LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
@@ -270,6 +272,8 @@ class ViewerServer:
         self._opened = contextlib.ExitStack()
         self._clients: dict[Hashable, Client] = {}
         self._numbers = count(1)
+        self._waits: dict[str, Mapping[str, Any]] = {}
+        """What takes its time now, which a new page is told too."""
         self._uploads = asyncio.Semaphore(_MAX_RECEIVED_BODIES)
         self._loop: asyncio.AbstractEventLoop | None = None
         try:
@@ -352,6 +356,10 @@ class ViewerServer:
         """Show a line on all pages."""
         self.post(None, "said", {"type": "said", "text": text, "bad": False})
 
+    def wait(self, kind: str, what: str = "", share: float | None = None) -> None:
+        """Show on all pages how far something is that takes its time; done where `what` is empty."""
+        self.post(None, f"wait {kind}", {"type": "wait", "kind": kind, "what": what, "share": share})
+
     def open(self, load: "Callable[[], Viewed]", *, warm: bool = True) -> "Session":
         """Load a scene and show it in the place of what was shown, prepared for the first photograph if it is
         to be `warm`.
@@ -360,9 +368,13 @@ class ViewerServer:
         """
         from .session import Session
 
-        viewed = load()  # while what was open stays open
-        self._close_session()
-        session = self._opened.enter_context(Session(viewed, self.post))
+        try:
+            viewed = load()  # while what was open stays open
+            self._close_session()
+            self.wait("opening", f"{viewed.name}: preparing it for the browser")
+            session = self._opened.enter_context(Session(viewed, self.post))
+        finally:
+            self.wait("opening")
         for path in viewed.references:
             try:
                 session.upload(path.read_bytes(), path.name)
@@ -380,6 +392,11 @@ class ViewerServer:
 
     def post(self, client: Hashable | None, kind: str, message: Mapping[str, Any] | bytes) -> None:
         """Send one client, or all (None), a message; from any thread."""
+        if not isinstance(message, bytes) and message["type"] == "wait":
+            if message["what"]:
+                self._waits[kind] = message
+            else:
+                self._waits.pop(kind, None)
         data = message if isinstance(message, bytes) else json.dumps(message)
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
@@ -427,6 +444,8 @@ class ViewerServer:
             Route("/style", self._take_style, methods=["POST"]),
             Route("/picture", self._picture, methods=["POST"]),
             Route("/photograph", self._photograph, methods=["POST"]),
+            Route("/preview", self._keep_preview, methods=["POST"]),
+            Route("/start/preview", self._preview),
             Route("/start", self._start_request, methods=["POST"]),
             Route("/start/piece", self._start_piece, methods=["POST"]),
         ]
@@ -440,7 +459,7 @@ class ViewerServer:
         number = next(self._numbers)
         client = Client()
         self._clients[number] = client
-        for kind, message in self._hello():
+        for kind, message in (*self._hello(), *self._waits.items()):
             client.put(kind, json.dumps(message))
 
         async def receive() -> None:
@@ -545,6 +564,21 @@ class ViewerServer:
         if self._start is None:
             raise HTTPException(404, "no start page here")
         return self._start
+
+    async def _keep_preview(self, request: Request) -> Response:
+        data = await self.body(request)
+        await asyncio.to_thread(self.session.keep_preview, data)
+        return JSONResponse({})
+
+    async def _preview(self, request: Request) -> Response:
+        from ..datamanagers.images import load_preview
+        from ..io.images import encode
+
+        path = self.start.preview(request.query_params.get("name", ""))
+        if path is None:
+            raise HTTPException(404, "no picture of this scene yet")
+        picture = await asyncio.to_thread(load_preview, path, _PREVIEW_PIXELS)
+        return Response(encode(picture, "webp"), media_type="image/webp")
 
     async def _start_request(self, request: Request) -> Response:
         asked = read_message(await self.body(request), StartRequest)

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from ..errors import DataError, FprfError, UsageError
+from ..io.atomic import write_bytes
 from ..io.images import Picture, encode
 from ..io.video import write_video
 from ..rendering.local_frame import read_offset
@@ -63,6 +64,8 @@ _FINAL_JPEG_QUALITY = 90
 """Quality of the whole picture; by eye."""
 SAVED_FORMATS = (".ply", ".spz", ".sog", ".glb")
 """Endings of files of Gaussians that the page saves."""
+_MAX_PREVIEW_BYTES = 1 << 20
+"""Bytes of a picture of what a page shows; the page sends some ten thousand."""
 _SAVING_DELAY_SECONDS = 1.0
 """From a change until it is kept on disk: a slider makes many; by eye."""
 
@@ -126,7 +129,10 @@ class Session:
         self._before: PageFile | None = None
         if viewed.root is not None:
             if viewed.capture is not None:
-                self._of = str(viewed.capture.path.resolve())
+                # Within the scene's folder by its place there, so that the folder can be renamed.
+                path = viewed.capture.path.resolve()
+                root = viewed.root.resolve()
+                self._of = str(path.relative_to(root) if path.is_relative_to(root) else path)
             self._folder = folder_of(viewed.root, self._of)
             self._before = read_page(self._folder)
 
@@ -357,17 +363,25 @@ class Session:
         """Decode and encode a photograph and restyle the scene with it, and with those that it is to `join`.
         Raises DataError for what is none.
         """
-        path = self.uploads.store(data)
+        shown = shown_name(name)
 
-        def add() -> Photograph:
-            photograph = self.restyler.encode(path, self.state.unused_name(shown_name(name)))
+        def add(path: Path) -> Photograph:
+            self.tell("photograph", f"{shown}: finding what it shows", 1 / 3)
+            photograph = self.restyler.encode(path, self.state.unused_name(shown))
+            self.tell("photograph", f"{shown}: giving the scene its style", 2 / 3)
             self.apply(lambda state: state.added(photograph, join))
             # Photographs that left the shelf and that no look needs go, with what was made of them: some 6 MB
             # each.
             self._drop_unused([photograph])
             return photograph
 
-        return self._worker.result(add)
+        try:
+            self.tell("photograph", f"{shown}: reading it", 0.0)
+            path = self.uploads.store(data)
+            return self._worker.result(partial(add, path))
+        finally:
+            self.tell("photograph", "", None)
+            self.tell("looking", "", None)  # at a capture, where that has failed
 
     def _drop_unused(self, new: Iterable[Photograph]) -> None:
         used = self.state.in_use | frozenset(self.state.shelf) | self._history.photographs
@@ -566,6 +580,15 @@ class Session:
 
         return encode(self._worker.result_when_idle(work()), "png")
 
+    def keep_preview(self, data: bytes) -> None:
+        """Keep a small picture of what a page shows, for the list of scenes. Raises DataError for what is none."""
+        root = self.viewed.root
+        if root is None or not root.is_dir() or len(data) > _MAX_PREVIEW_BYTES:
+            return
+        path = self.uploads.store(data)
+        write_bytes(root / "page" / "preview.png", path.read_bytes())
+        path.unlink()
+
     def _refresh(self) -> None:
         """Show all clients what is shown now."""
         with self._lock:
@@ -591,7 +614,11 @@ class Session:
         """Make colours for browsers, of what is shown now or of a look that is kept."""
         scene = self.viewed.scene
         assert isinstance(scene, SplatScene)
-        colours = gaussian_colours(scene, self.packed, self.restyler, shown)
+        self.tell("colouring", f"Colouring {len(scene.gaussians):,} Gaussians", None)
+        try:
+            colours = gaussian_colours(scene, self.packed, self.restyler, shown)
+        finally:
+            self.tell("colouring", "", None)
         version = next(self._version)
         self._colours[name] = (
             version,

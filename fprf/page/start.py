@@ -9,6 +9,7 @@ that they print, and from the first checkpoint on the scene itself (`session.py`
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,9 +22,10 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from ..datamanagers.images import IMAGE_SUFFIXES
 from ..errors import DataError, FprfError, UsageError
 from . import GARDEN
-from .messages import Leave, Make, New, Open, StartRequest, Stop
+from .messages import Discard, Leave, Make, New, Open, Remove, Rename, StartRequest, Stop
 from .uploads import SceneFiles, Source, find_source, is_capture, newest_step, training_progress
 
 if TYPE_CHECKING:
@@ -40,6 +42,12 @@ _MAX_RECENT_SCENES = 12
 """Scenes that the page offers to open; by eye."""
 _MAX_EXIT_SECONDS = 10.0
 """Seconds that a process has to save and end; by eye."""
+_MAX_SILENT_SECONDS = 60.0
+"""Without a piece of a file, after which a page that was sending has given up; by eye."""
+_INCOMING_FOLDER = ".incoming"
+"""Files that are being sent: they get their place when a scene is made of them."""
+_PREVIEW = Path("page", "preview.png")
+"""In the folder of a run or a capture's scene: what its page showed last."""
 
 StartStage: TypeAlias = Literal["idle", "poses", "training", "opening", "open"]
 
@@ -76,6 +84,13 @@ class Start:
         self._server = server
         self._load = load
         self._uploads: dict[str, SceneFiles] = {}
+        self._incoming = self._output / _INCOMING_FOLDER / str(os.getpid())
+        self._heard = 0.0
+        """When a piece of a file came last, by `time.monotonic`."""
+        self._sending = ""
+        """Scene whose files are coming."""
+        self._previews: dict[str, Path] = {}
+        """Where scenes of the list lie, by name."""
         self._progress = StartProgress()
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
@@ -88,6 +103,11 @@ class Start:
         self._interrupt("leave")
         if self._thread is not None:
             self._thread.join(_MAX_EXIT_SECONDS)
+            if self._process is not None:
+                _end_group(self._process, getattr(signal, "SIGKILL", signal.SIGTERM))
+                self._thread.join(_MAX_EXIT_SECONDS)
+        shutil.rmtree(self._incoming, ignore_errors=True)
+        self._remove_empty()
 
     def state(self) -> dict[str, Any]:
         """How far it is, as the page reads it; idle, what can be opened."""
@@ -99,7 +119,13 @@ class Start:
             "output": str(self._output),
             "recent": recent,
             "garden": str(GARDEN),
+            "sending": self._sending if self._receiving else "",
         }
+
+    @property
+    def _receiving(self) -> bool:
+        """Some page is sending files."""
+        return bool(self._sending) and time.monotonic() - self._heard < _MAX_SILENT_SECONDS
 
     def handle(self, asked: StartRequest) -> dict[str, str]:
         """Do what the page asks for. Raises UsageError or DataError where no scene can be made of what is
@@ -107,18 +133,52 @@ class Start:
         """
         match asked:
             case New():
+                # Told before anything is sent.
+                self._check_free()
+                if self._receiving:
+                    raise UsageError(
+                        f"{self._sending} is being sent from another page; wait until it is there"
+                    )
+                self._remove_stale()
                 name = self._unused(asked.name)
-                self._uploads[name] = SceneFiles(self._output / name / _FILES_FOLDER)
+                self._uploads[name] = SceneFiles(self._incoming / name)
+                self._sending = name
+                self._heard = time.monotonic()
+                self._server.post(None, "start", self.state())
                 return {"scene": name}
+            case Discard():
+                self._discard(asked.scene)
             case Make():
                 # The folder came with the first file that was taken: none of those that were sent may have
                 # been.
                 folder = self._upload(asked.scene).folder
-                if not folder.is_dir():
+                try:
+                    if not folder.is_dir():
+                        raise UsageError(
+                            "none of these files can become a scene; give photographs, a video or a capture"
+                        )
+                    find_source(folder)
+                    self._check_free()
+                except FprfError:
+                    self._discard(asked.scene)
+                    raise
+                target = self._output / asked.scene / _FILES_FOLDER
+                target.parent.mkdir(parents=True)
+                folder.rename(target)
+                self._discard(asked.scene)
+                self._begin(find_source(target), asked.scene, asked.minutes)
+            case Rename():
+                folder = self._listed(asked.scene)
+                name = self._unused(asked.name)
+                if name != asked.name:
                     raise UsageError(
-                        "none of these files can become a scene; give photographs, a video or a capture"
+                        f"{asked.name[:60]!r}: no name for a folder, or there is one already; {name!r} would do"
                     )
-                self._begin(find_source(folder), asked.scene, asked.minutes)
+                folder.rename(self._output / name)
+                self._server.post(None, "start", self.state())
+            case Remove():
+                shutil.rmtree(self._listed(asked.scene))
+                self._server.post(None, "start", self.state())
             case Open():
                 # A file or folder of this machine, by its path as it is copied from elsewhere.
                 if not (text := asked.path.strip().strip("\"'")):
@@ -141,6 +201,8 @@ class Start:
                         name = self._unused(path.stem)
                 self._begin(source, name, asked.minutes)
             case Stop() if self._progress.error is None:
+                if self._busy:
+                    self._server.wait("ending", "Ending it; what there is is being saved")
                 self._interrupt("stop")
             case Stop() | Leave():  # a failure is put away, with what is shown of it
                 if self._busy:
@@ -155,15 +217,66 @@ class Start:
 
     def piece(self, scene: str, name: str, at: int, size: int, data: bytes) -> None:
         """Take a piece of a file. Raises as `SceneFiles.add`."""
+        self._heard = time.monotonic()
         self._upload(scene).add(name, at, size, data)
+
+    def _check_free(self) -> None:
+        """Raise UsageError while a scene is being made."""
+        if self._busy:
+            name = self._progress.name  # none after `leave`, while what there is of it is saved
+            raise UsageError(
+                f"{name} is being made; stop it first" if name else "a scene is being saved; try again"
+            )
+
+    def _discard(self, name: str) -> None:
+        """Forget files that were sent, where no scene was made of them."""
+        upload = self._uploads.pop(name, None)
+        if upload is not None:
+            shutil.rmtree(upload.folder, ignore_errors=True)
+            self._remove_empty()
+        if self._sending == name:
+            self._sending = ""
+            self._server.post(None, "start", self.state())
+
+    def _remove_empty(self) -> None:
+        with contextlib.suppress(OSError):  # other files are coming, or there were none
+            for folder in (self._incoming, self._incoming.parent):
+                if folder.is_dir():
+                    folder.rmdir()
+
+    def _remove_stale(self) -> None:
+        """Remove files that pages began to send and gave up, to this viewer or to one that was killed."""
+        for name in [*self._uploads]:
+            self._discard(name)
+        for folder in self._incoming.parent.glob("*"):
+            if folder.name.isdecimal() and not _is_alive(int(folder.name)):
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _listed(self, name: str) -> Path:
+        """The folder of a scene that can be renamed or deleted. Raises UsageError for any other."""
+        folder = self._output / name
+        if folder.parent != self._output or not folder.is_dir() or name.startswith("."):
+            raise UsageError(f"{name[:60]!r}: no scene of {self._output}")
+        if self._progress.stage != "idle" and self._progress.name == name:
+            raise UsageError(f"{name} is being made or shown; close it first")
+        return folder
+
+    def preview(self, name: str) -> Path | None:
+        """A picture of a scene of the list: what its page showed last, else its first photograph."""
+        root = self._previews.get(name)
+        if root is None:
+            return None
+        found = [root / _PREVIEW]
+        for folder in (root, root.with_name(_FILES_FOLDER), root / _FILES_FOLDER, root / "images"):
+            if folder.is_dir():
+                found += sorted(each for each in folder.rglob("*") if each.suffix.lower() in IMAGE_SUFFIXES)[
+                    :1
+                ]
+        return next((path for path in found if path.is_file()), None)
 
     def _begin(self, source: Source, name: str, minutes: float) -> None:
         with self._lock:
-            if self._busy:
-                name = self._progress.name  # none after `leave`, while what there is of it is saved
-                raise UsageError(
-                    f"{name} is being made; stop it first" if name else "a scene is being saved; try again"
-                )
+            self._check_free()
             # One scene is made at a time: training takes all cores.
             self._stopped = ""
             if source.kind != "run":
@@ -201,9 +314,13 @@ class Start:
             self._progress = StartProgress()
             self._server.show_start(self)
         except FprfError as error:
+            if source.kind == "capture" and source.path.is_relative_to(root / _FILES_FOLDER):
+                shutil.rmtree(root, ignore_errors=True)  # it was refused: nothing is left of what was sent
             self._set(error=str(error))
         except Exception as error:  # whatever it is, the page goes on and the files are there
             self._set(error=f"this should not have happened: {type(error).__name__}: {error}")
+        finally:
+            self._server.wait("ending")
 
     def _train(self, data: Path, run: Path, name: str, minutes: float) -> None:
         """Train a scene; from its first checkpoint on the viewer shows it."""
@@ -251,6 +368,8 @@ class Start:
                 if line.strip():
                     last = line.strip()
                     self._read(last)
+        # What it has begun, as the worker that finds poses, ends with it.
+        _end_group(process, getattr(signal, "SIGKILL", signal.SIGTERM))
         self._process = None
         # An interrupted training has saved what there was, if there was anything; nothing else is worth going
         # on with.
@@ -292,9 +411,10 @@ class Start:
         self._stopped = then
         process = self._process
         if process is not None:
-            with contextlib.suppress(OSError):
-                process.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
-            last = threading.Timer(_MAX_EXIT_SECONDS, process.kill)
+            _end_group(process, getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT))
+            last = threading.Timer(
+                _MAX_EXIT_SECONDS, _end_group, (process, getattr(signal, "SIGKILL", signal.SIGTERM))
+            )
             last.daemon = True
             last.start()
 
@@ -323,40 +443,75 @@ class Start:
         return name
 
     def _recent(self) -> list[dict[str, str]]:
-        """Scenes and runs on this machine, the newest first."""
-        # Runs of the terminal lie in `runs`, that of the demo in its folder.
-        found = [(Path("demo/run"), "demo")]
-        for path in Path("runs").glob("*/config.json"):
-            if newest_step(path.parent) >= 0:
-                found.append((path.parent, path.parent.name))
-        # A scene's run, and its files where training has not come to its end.
+        """Scenes and runs on this machine, trained ones first and of each kind the newest."""
+        rows: list[tuple[bool, float, dict[str, str]]] = []
+        previews = {}
+        # Runs of the terminal lie in `runs`, that of the demo in its folder; they are not ours to rename.
+        for run in (Path("demo/run"), *(path.parent for path in Path("runs").glob("*/config.json"))):
+            if newest_step(run) >= 0:
+                name = "demo" if run.parent.name == "demo" else run.name
+                rows.append((True, run.stat().st_mtime, _row(run, name, "trained")))
+                previews[name] = run
         for folder in self._output.glob("*/"):
+            name = folder.name
             run = folder / _RUN_FOLDER
             files = folder / _FILES_FOLDER
             scene = folder / _SCENE_FOLDER
-            trained = newest_step(run) >= 0
-            progress: dict[str, Any] | None = {"share": 0}
-            if trained:
+            source = files if files.is_dir() else scene
+            if newest_step(run) >= 0:
+                # What was stopped before its end can go on, where its photographs are still there.
                 progress = training_progress(run)
-                found.append((run, folder.name))
-            if progress is not None and progress["share"] < 1:
-                found.append((scene if trained and not files.is_dir() else files, folder.name))
-        dated = []
-        for path, name in found:
-            if path.is_dir():
-                dated.append((path.stat().st_mtime, path, name))
-        rows = []
-        for date, path, name in sorted(dated, reverse=True)[:_MAX_RECENT_SCENES]:
-            kind = "trained"
-            if path.name in (_FILES_FOLDER, _SCENE_FOLDER):
-                some = newest_step(path.with_name(_RUN_FOLDER)) >= 0
-                capture = any(is_capture(each) for each in (path, *path.iterdir()))
-                if some:
-                    kind = "train on"
-                elif capture:
-                    kind = "capture"
-                else:
-                    kind = "not trained yet"
-            when = time.strftime("%d %b %H:%M", time.localtime(date))
-            rows.append({"path": str(path.resolve()), "name": name, "kind": kind, "when": when})
-        return rows
+                stopped = progress is not None and progress["share"] < 1
+                kind = (
+                    f"stopped at {100 * progress['share']:.0f} %"
+                    if progress is not None and stopped
+                    else "trained"
+                )
+                row = _row(run, name, kind)
+                if stopped and source.is_dir():
+                    row["more"] = str(source.resolve())
+                rows.append((True, run.stat().st_mtime, {**row, "scene": name}))
+                previews[name] = run
+            elif source.is_dir():
+                capture = any(is_capture(each) for each in (source, *source.iterdir()))
+                kind = "capture" if capture else "not trained yet"
+                rows.append((capture, source.stat().st_mtime, {**_row(source, name, kind), "scene": name}))
+                previews[name] = folder
+        self._previews = previews
+        rows.sort(key=lambda row: row[:2], reverse=True)
+        return [row for _, _, row in rows[:_MAX_RECENT_SCENES]]
+
+
+def _row(path: Path, name: str, kind: str) -> dict[str, str]:
+    """A scene of the list; `scene` is its folder where it can be renamed and deleted, `more` what it can be
+    trained on with.
+    """
+    when = time.strftime("%d %b %H:%M", time.localtime(path.stat().st_mtime))
+    return {
+        "path": str(path.resolve()),
+        "name": name,
+        "kind": kind,
+        "when": when,
+        "scene": "",
+        "more": "",
+    }
+
+
+def _end_group(process: "subprocess.Popen[str]", number: int) -> None:
+    """Send a signal to a process and all that it has begun; its group is its own."""
+    with contextlib.suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, number)
+        else:
+            process.send_signal(number)
+
+
+def _is_alive(process: int) -> bool:
+    """True for the number of a process that runs."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

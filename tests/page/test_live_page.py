@@ -68,10 +68,13 @@ def served(run: Path | None, *args: str) -> Iterator[str]:
 
 
 @contextmanager
-def front(address: str, ready: str = ".place.drawn", width: int = 1000, height: int = 700) -> Iterator[Any]:
+def front(
+    address: str, ready: str = ".place.drawn", width: int = 1000, height: int = 700, script: str = ""
+) -> Iterator[Any]:
     """A page that shows the element `ready`; it makes no error."""
     with chromium() as browser:
         page = browser.new_page(viewport={"width": width, "height": height})
+        page.add_init_script(script)
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address, timeout=120_000)
@@ -280,6 +283,78 @@ def test_what_is_made_is_kept_and_a_lost_viewer_is_said(world: World, tmp_path: 
             assert cv2.imread(str(tmp_path / "picture.png")).shape[:2] == (2 * wide[0], 2 * wide[1])
 
 
+NO_WEBGL = """const get = HTMLCanvasElement.prototype.getContext; HTMLCanvasElement.prototype.getContext =
+  function (kind, ...more) { return kind.startsWith("webgl") ? null : get.call(this, kind, ...more); };"""
+
+
+def test_without_webgl_the_viewer_draws_and_says_so(world: World) -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        session = server.open(lambda: Viewed(seen(ball(400, 2)), "ball", 1), warm=False)
+        with front(server.address, script=NO_WEBGL) as page:
+            said = page.locator(".why").inner_text()
+            assert said.startswith("This browser has no WebGL 2. The machine of the viewer draws")
+            read = "() => [...at('canvas').getContext('2d').getImageData(200, 100, 300, 300).data]"
+            plain = page.evaluate(read)
+            assert max(plain) > 60 and page.locator("#said .bad").count() == 0
+            session.upload(world.references[0].read_bytes(), "dusk.png")
+            page.wait_for_function("() => fprf.stage.to === 'Now' && !fprf.live.remote.busy")
+            page.wait_for_function(
+                "(before) => [...at('canvas').getContext('2d').getImageData(200, 100, 300, 300).data]"
+                ".some((x, i) => Math.abs(x - before[i]) > 20)",
+                arg=plain,
+                timeout=60_000,
+            )
+
+
+def test_a_lost_context_is_said_and_a_picture_stands_in() -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        server.open(lambda: Viewed(seen(ball(400, 2)), "ball", 1), warm=False)
+        with front(server.address) as page:
+            page.wait_for_function("() => document.querySelector('.still.one').naturalWidth > 100")
+            page.evaluate(
+                """() => { window.lose = fprf.place.splats.gl.getExtension('WEBGL_lose_context');
+                lose.loseContext(); }"""
+            )
+            page.locator(".why", has_text="The graphics card has dropped the picture").wait_for()
+            assert page.locator(".still.one").is_visible()
+            page.mouse.dblclick(300, 300)
+            page.locator("#save-picture").click()
+            page.locator("#said .bad", has_text="The graphics card").wait_for()
+            page.evaluate("() => lose.restoreContext()")
+            page.locator(".why").wait_for(state="detached")
+            page.wait_for_selector(".place.drawn")
+
+
+def test_without_javascript_the_page_says_what_it_needs() -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server, chromium() as browser:
+        page = browser.new_context(java_script_enabled=False).new_page()
+        page.goto(server.address)
+        assert page.locator("noscript").inner_text().startswith("This page needs JavaScript")
+        assert not page.locator("#loading").is_visible()
+
+
+def test_leaving_during_an_upload_asks_and_another_page_is_told_before_it_sends(tmp_path: Path) -> None:
+    shipped = Path(str(files("fprf") / "garden"))
+    given = [str(path) for path in sorted((shipped / "images").glob("*"))[:4]]
+    with served(None, "--output", str(tmp_path / "made")) as address, front(address, "#drop") as page:
+        held: list[Any] = []
+        page.route("**/start/piece*", lambda route: held.append(route))
+        page.locator("#start h1").click()  # browsers ask only where somebody has done something
+        page.set_input_files("#files", given)
+        page.locator("#what", has_text="sending").wait_for()
+        other = page.context.browser.new_page()
+        other.goto(address)
+        other.locator("#busy", has_text="is being sent from another page").wait_for()
+        other.set_input_files("#files", given)
+        other.locator("#fault", has_text="is being sent from another page; wait").wait_for()
+        asked: list[str] = []
+        page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.accept()))
+        page.evaluate("() => { setTimeout(() => location.assign('about:blank')); }")
+        page.wait_for_url("about:blank")
+        other.locator("#busy").wait_for(state="hidden", timeout=60_000)
+        assert asked == ["beforeunload"] and [*tmp_path.glob("made/*")] == []
+
+
 def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:
     shipped = Path(str(files("fprf") / "garden"))
     given = tmp_path / "garden"
@@ -293,6 +368,11 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         page.locator("#fault", has_text="notes.txt: cannot become a scene").wait_for()
         page.set_input_files("#files", str(shipped / "references" / "night.jpg"))
         page.locator("#fault", has_text="1 photograph is no scene").wait_for()
+        page.fill("#minutes", "5000")
+        page.keyboard.press("Tab")
+        page.locator(
+            "#fault", has_text="Training takes from 0.1 to 600 minutes; 5000 is none of these"
+        ).wait_for()
         page.fill("#minutes", "5")
         page.set_input_files("#folder", str(given))
         page.wait_for_selector(".place.drawn", timeout=240_000)  # of the training, which need not end
@@ -318,8 +398,18 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         downloaded.value.save_as(tmp_path / "picture.png")
         assert cv2.imread(str(tmp_path / "picture.png")).std() > 20
         page.locator("#scenes").click()
-        page.get_by_role("button", name="garden trained").wait_for()
-        page.get_by_role("button", name="garden train on").wait_for()  # it was stopped before its end
+        page.get_by_role("button", name="garden stopped at").wait_for()
+        page.get_by_role("button", name="Train on").wait_for()  # it was stopped before its end
+        page.wait_for_function("() => document.querySelector('#recent img')?.naturalWidth > 100")
+        assert {path.name for path in made.iterdir()} == {"garden"}, "nothing of what was refused"
+        page.get_by_role("button", name="Rename garden").click()
+        page.locator("dialog input").fill("yard")
+        page.locator("dialog button", has_text="Rename").click()
+        page.get_by_role("button", name="yard stopped at").wait_for()
+        page.get_by_role("button", name="Delete yard").click()
+        page.locator("dialog button", has_text="Delete").click()
+        page.locator("#recent").wait_for(state="hidden")
+        assert [*made.iterdir()] == []
 
 
 @pytest.mark.parametrize("method", ["fprf-lite", "fprf-splats"])

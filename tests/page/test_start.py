@@ -13,8 +13,9 @@ import pytest
 from session_helpers import until
 
 from fprf.errors import CheckpointError, DataError, FprfError, UsageError
+from fprf.page import EXAMPLES
 from fprf.page import start as start_module
-from fprf.page.messages import Leave, Make, New, Open, Stop
+from fprf.page.messages import Discard, Leave, Make, New, Open, Remove, Rename, Stop
 from fprf.page.server import Access, ViewerServer
 from fprf.page.session import TrainingFollower, Viewed, view_of_run
 from fprf.page.start import Start
@@ -78,6 +79,9 @@ class Shown(Start):
 
     def show_start(self, start: Start) -> None:
         self.shown.clear()
+
+    def wait(self, kind: str, what: str = "", share: float | None = None) -> None:
+        """The server's."""
 
     def post(self, client: None, kind: str, message: Any) -> None:
         self.posted.append(message)
@@ -151,8 +155,118 @@ def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, t
     page.piece(scene, "x.ply", 0, 4, b"ply\n")
     page.handle(Make(scene=scene))
     page.reached(error="of two dimensions")
-    assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
-    assert page.handle(New(name="My capture.ply"))["scene"] == "My-capture-ply-2"
+    assert left(tmp_path) == set(), "nothing of what was refused"
+
+
+def left(tmp_path: Path) -> set[str]:
+    """What there is of the scenes on the disk."""
+    return {path.name for path in (tmp_path / "made").glob("*")}
+
+
+def test_nothing_is_left_of_what_was_refused_or_given_up(page: Shown, tmp_path: Path) -> None:
+    scene = page.handle(New(name="yard"))["scene"]
+    with pytest.raises(UsageError, match="yard is being sent from another page"):
+        page.handle(New(name="house"))
+    page.piece(scene, "a.ply", 0, 4, b"ply\n")
+    assert page.state()["sending"] == "yard" and page.state()["recent"] == []
+    page.handle(Discard(scene=scene))
+    assert page.state()["sending"] == "" and left(tmp_path) == set()
+    # One photograph is no scene.
+    scene = page.handle(New(name="yard"))["scene"]
+    page.piece(scene, "a.jpg", 0, 4, b"\xff\xd8\xff\xe0")
+    with pytest.raises(DataError, match="1 photograph is no scene"):
+        page.handle(Make(scene=scene))
+    assert left(tmp_path) == set() and page.handle(New(name="yard"))["scene"] == "yard"
+    page.handle(Discard(scene="yard"))
+    # A page that went away in the middle, and a viewer that was killed.
+    page.piece(page.handle(New(name="yard"))["scene"], "a.ply", 0, 9, b"ply\n")
+    page._heard -= 100
+    killed = tmp_path / "made" / ".incoming" / "999999999" / "yard"
+    killed.mkdir(parents=True)
+    assert page.handle(New(name="yard"))["scene"] == "yard" and not killed.exists()
+    page.piece("yard", "a.ply", 0, 9, b"ply\n")
+    page.close()
+    assert left(tmp_path) == set()
+
+
+def test_scenes_are_renamed_and_deleted(page: Shown, photographs: Path, tmp_path: Path) -> None:
+    page.handle(Open(path=str(photographs), minutes=1))
+    page.reached(stage="open")
+    with pytest.raises(UsageError, match="close it first"):
+        page.handle(Remove(scene="yard"))
+    page.handle(Leave())
+    page.reached(stage="idle")
+    (tmp_path / "made" / "other").mkdir()
+    for wrong in (
+        Rename(scene="yard", name="other"),
+        Rename(scene="yard", name="../x"),
+        Rename(scene="../yard", name="x"),
+        Remove(scene="no such"),
+        Remove(scene=""),
+        Remove(scene="../yard"),
+    ):
+        with pytest.raises(UsageError):
+            page.handle(wrong)
+    page.handle(Rename(scene="yard", name="garden"))
+    row = page.state()["recent"][0]
+    assert (row["name"], row["scene"], row["kind"]) == ("garden", "garden", "trained")
+    assert page.preview("yard") is None
+    page.handle(Remove(scene="garden"))
+    assert page.state()["recent"] == [] and photographs.is_dir() and left(tmp_path) == {"other"}
+
+
+def test_scenes_that_are_trained_come_first(page: Shown, tmp_path: Path) -> None:
+    for number in range(14):
+        folder = tmp_path / "made" / f"failed-{number}" / "files"
+        folder.mkdir(parents=True)
+        (folder / "a.jpg").touch()
+    run = tmp_path / "made" / "yard" / "run"
+    (run / "checkpoints" / "step-0000007").mkdir(parents=True)
+    (run / "checkpoints" / "step-0000007" / "manifest.json").touch()
+    os.utime(run, (1, 1))
+    recent = page.state()["recent"]
+    assert len(recent) == 12 and (recent[0]["name"], recent[0]["kind"]) == ("yard", "trained")
+    (run.parent / "files").mkdir()
+    shutil.copyfile(EXAMPLES["night.jpg"], run.parent / "files" / "a.jpg")
+    assert page.state() and page.preview("yard") == run.parent / "files" / "a.jpg"
+    (run / "page").mkdir()
+    (run / "page" / "preview.png").touch()
+    assert page.preview("yard") == run / "page" / "preview.png"
+
+
+DEAF = f"""#!{sys.executable}
+import pathlib, signal, subprocess, sys, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+deaf = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); print('ready', flush=True); time.sleep(1000)"
+worker = subprocess.Popen([{sys.executable!r}, "-c", deaf], stdout=subprocess.PIPE)
+worker.stdout.readline()
+print("worker", worker.pid, flush=True)
+time.sleep(1000)
+"""
+
+
+def test_nothing_that_was_begun_outlives_a_stop(
+    page: Shown, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "python").write_text(DEAF)
+    monkeypatch.setattr(start_module, "_MAX_EXIT_SECONDS", 0.3)
+    page.handle(Open(path=str(photographs)))
+    until(lambda: bool(page.state()["lines"]))
+    worker = int(page.state()["lines"][-1].split()[1])
+    assert page._process is not None
+    leader = page._process.pid
+    page.handle(Stop())
+    until(lambda: not page._busy)
+    for process in (leader, worker):
+        until(lambda process=process: has_ended(process))  # type: ignore[misc]
+
+
+def has_ended(process: int) -> bool:
+    """True where no process has this number, or one that waits to be collected by the system."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
 
 
 def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Shown, photographs: Path) -> None:
@@ -162,10 +276,9 @@ def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Show
     page.handle(Stop())
     recent = page.reached(stage="idle")["recent"]
     assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [
-        ("yard", "trained"),
-        ("yard", "train on"),
+        ("yard", "stopped at 50 %")
     ]
-    page.handle(Open(path=recent[1]["path"]))
+    page.handle(Open(path=recent[0]["more"]))
     page.reached(name="yard", stage="training", share=0.5)
     page.handle(Leave())
     with pytest.raises(UsageError, match="a scene is being saved"):
@@ -174,6 +287,7 @@ def test_a_training_that_failed_past_its_first_checkpoint_is_put_away(page: Show
 
 def test_requests_that_make_no_sense_are_refused(page: Shown) -> None:
     empty = page.handle(New(name=""))["scene"]
+    page.handle(Discard(scene=empty))
     wrong = (Open(path=" "), Open(path="/no/such"), Open(path="~nobody-here/x"))
     for asked in (Make(scene=empty), Make(scene="../yard"), *wrong):
         with pytest.raises(FprfError):

@@ -1,6 +1,7 @@
 // Scenes that the server draws: the newest pictures on the canvas, and requests for others where the camera moves.
 
 const VIEW_MS = 40; // between two requests; by eye
+const REMOTE_PIXELS = 960; // longest side of pictures of Gaussians that the server draws; by eye
 
 /** Pictures of a scene without Gaussians. */
 class Field {
@@ -60,5 +61,40 @@ class Field {
     }
     place.changed = place.moved;
     this.draw();
+  }
+}
+
+/** Pictures of Gaussians for a browser that cannot draw them: one at a time, of where the camera was last. */
+class Remote {
+  /** @param {Live} live */
+  constructor(live) {
+    this.live = live;
+    this.busy = false;
+    this.stale = true; // what is on the canvas is not what is to be seen
+  }
+
+  /** Once a frame: ask for what is to be seen where that has changed and no picture is under way. */
+  step() {
+    const { place, stage } = this.live;
+    if (place?.changed || place?.moved) this.stale = true;
+    if (!place || !stage || !this.stale || this.busy) return;
+    place.changed = false;
+    place.moved = false;
+    this.stale = false;
+    this.busy = true;
+    const { canvas } = place;
+    const side = Math.max(64, Math.min(REMOTE_PIXELS, Math.max(canvas.width, canvas.height)));
+    const picture = { type: "picture", camera: this.live.camera(), side, shown: stage.to, wipe: place.wipe };
+    this.draw(picture).catch((error) => say(error.message, true)).finally(() => { this.busy = false; });
+  }
+
+  async draw(picture) {
+    const answer = await asked("/picture", { method: "POST", body: JSON.stringify(picture) });
+    if (!answer.ok) throw new Error((await answer.text()).trim());
+    const bitmap = await createImageBitmap(await answer.blob());
+    const { canvas } = this.live.place;
+    canvas.getContext("2d").drawImage(bitmap, 0, 0, canvas.width, canvas.height);
+    bitmap.close();
+    at("place").classList.add("drawn");
   }
 }

@@ -5,6 +5,7 @@
 const RECONNECT_MS = 1500; // until a lost connection is tried again; by eye
 const NOTE_MS = 6000; // that a note stays; by eye
 const MAX_NOTES = 4; // at the same time; by eye
+const PREVIEW_PIXELS = 320; // longest side of the picture in the list of scenes; by eye
 
 /**
  * The head of a scene, as the server tells it (session.py).
@@ -96,9 +97,10 @@ const wait = (kind, what = "", share = null) => {
  * Ask before something is lost.
  * @param {string} question
  * @param {Object<string, () => void>} answers what is done, by its word
+ * @param {...HTMLElement} more fields of the question
  */
-const question = (text, answers) => {
-  const box = make("dialog", { className: "ask" }, make("p", { textContent: text }));
+const question = (text, answers, ...more) => {
+  const box = make("dialog", { className: "ask" }, make("p", { textContent: text }), ...more);
   const row = make("div", { className: "row" });
   for (const [word, act] of Object.entries({ ...answers, Cancel: () => {} })) {
     row.append(make("button", { type: "button", className: "pill", textContent: word, onclick: () => { box.close(); act(); } }));
@@ -112,11 +114,12 @@ const question = (text, answers) => {
 /**
  * JSON and sections of one body (pack.py): bytes of the head as a number of four bytes, the head, the sections.
  * @param {Response} answer
+ * @param {(share: ?number) => void=} tell how much of it has come
  * @returns {Promise<{head: any, parts: Object<string, Uint8Array>}>}
  */
-const unpacked = async (answer) => {
+const unpacked = async (answer, tell = () => {}) => {
   if (!answer.ok) throw new Error((await answer.text()).trim());
-  const data = new Uint8Array(await answer.arrayBuffer());
+  const data = new Uint8Array(await (await counted(answer, tell)).arrayBuffer());
   const length = new DataView(data.buffer).getUint32(0, true);
   const head = JSON.parse(new TextDecoder().decode(data.subarray(4, 4 + length)));
   const parts = {};
@@ -175,7 +178,8 @@ class Live {
     this.panel = new Panel(this);
     this.photographs = new Photographs(this);
     at("finish").onclick = () => this.start.stop();
-    at("scenes").onclick = () => post("/start", JSON.stringify({ type: "leave" })).catch((error) => say(error.message, true));
+    at("scenes").onclick = () => this.leave();
+    this.mode("loading");
     this.connect();
   }
 
@@ -194,6 +198,17 @@ class Live {
       wait("connection", "Connection lost. It is tried again until the viewer answers; nothing can be changed meanwhile.");
       setTimeout(() => this.connect(), RECONNECT_MS);
     };
+  }
+
+  /** Back to the list of scenes. */
+  async leave() {
+    wait("leaving", "Closing the scene; what there is is being saved");
+    try {
+      await post("/start", JSON.stringify({ type: "leave" }));
+    } catch (error) {
+      wait("leaving");
+      say(error.message, true);
+    }
   }
 
   get connected() { return this.socket.readyState === WebSocket.OPEN; }
@@ -270,7 +285,8 @@ class Live {
       this.place.touch();
       return;
     }
-    const { head, parts } = await unpacked(await asked("/scene"));
+    const { head, parts } = await unpacked(await asked("/scene"), (share) => wait("scene", "Fetching the scene", share));
+    wait("scene", "Unpacking the scene");
     this.mode("scene");
     this.scene = scene;
     document.title = `${scene.name} - fprf`;
@@ -279,28 +295,50 @@ class Live {
     at("save-ply").hidden = !scene.gaussians;
     head.alone = true;
     let splats = null;
-    if (scene.gaussians) {
-      splats = before ? this.place.splats : new Splats(at("canvas"));
-      await splats.load(head, parts);
-      await splats.add("Captured", head.styles[0], parts["style-0"]);
+    if (scene.gaussians && !this.remote) {
+      try {
+        splats = before ? this.place.splats : new Splats(at("canvas"));
+        await splats.load(head, parts);
+        await splats.add("Captured", head.styles[0], parts["style-0"]);
+      } catch (error) {
+        if (before) throw error;
+        splats = null;
+        this.drawThere(error.message);
+      }
     }
+    wait("scene");
     if (before) {
       this.place.scene = head;
       this.place.touch();
     } else this.enter(head, splats);
   }
 
+  /** Let the server draw what this browser cannot. */
+  drawThere(why) {
+    explain(at("place"), `${why[0].toUpperCase()}${why.slice(1)}. The machine of the viewer draws the pictures instead; they come more slowly.`);
+    const canvas = at("canvas").cloneNode(); // of one that was asked for WebGL nothing else can be had
+    at("canvas").replaceWith(canvas);
+    this.remote = new Remote(this);
+  }
+
   /** Make the stage of a scene that is shown for the first time; `splats` null = the server draws. */
   enter(head, splats) {
-    this.place = new Place(at("canvas"), head, splats, splats ? null : () => this.field.step());
+    this.place = new Place(at("canvas"), head, splats, splats ? null : () => (this.remote ?? this.field).step());
+    this.place.listeners.lost = (lost) => {
+      at("place").classList.toggle("drawn", !lost);
+      explain(at("place"), lost ? LOST : "");
+    };
     this.place.listeners.pick = (x, y) => {
       if (!this.state?.shelf.length) return; // nothing could be said about what is picked
       const box = at("canvas").getBoundingClientRect();
       this.tell("pick", { camera: this.camera(), x: (x - box.left) / box.width, y: (y - box.top) / box.height });
     };
-    this.place.listeners.drawn = () => at("place").classList.add("drawn");
+    this.place.listeners.drawn = (rest) => {
+      at("place").classList.add("drawn");
+      if (rest) this.preview();
+    };
     this.stage = new Stage(this.place, [{ name: "Captured" }]);
-    if (!splats) {
+    if (!splats && !this.remote) {
       this.stage.add({ name: "Now" });
       this.stage.choose("Now");
     }
@@ -311,6 +349,26 @@ class Live {
       if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" });
     };
     window.fprf = { place: this.place, stage: this.stage, live: this };
+  }
+
+  /** A small picture of what is shown, once, for the list of scenes. */
+  preview() {
+    const { place, scene } = this;
+    if (this.previewed === scene.step || !place.splats) return;
+    this.previewed = scene.step;
+    const { canvas } = place;
+    const by = PREVIEW_PIXELS / Math.max(canvas.width, canvas.height);
+    const small = make("canvas", { width: Math.max(1, Math.round(by * canvas.width)), height: Math.max(1, Math.round(by * canvas.height)) });
+    place.splats.draw(place.camera.view, place.lens, place.look, { near: place.scene.near, background: place.scene.background, exact: true });
+    small.getContext("2d").drawImage(canvas, 0, 0, small.width, small.height);
+    small.toBlob((blob) => {
+      // It stands in, too, where the graphics card drops the picture.
+      const still = document.querySelector(".still.one");
+      URL.revokeObjectURL(still.src);
+      still.src = URL.createObjectURL(blob);
+      still.hidden = false;
+      post("/preview", blob).catch(() => {});
+    }, "image/jpeg");
   }
 
   /** Progress of the scene's training. */
@@ -324,9 +382,12 @@ class Live {
 
   /** Fetch colours that the server has made, under a name of the stage. */
   async recolour({ name, version }) {
+    if (this.remote) this.remote.stale = true;
     const address = `/colours?name=${encodeURIComponent(name)}&version=${version}`;
-    const { head, parts } = await unpacked(await asked(address));
-    await this.place.splats.add(name, head, parts.rows);
+    if (this.place.splats) {
+      const { head, parts } = await unpacked(await asked(address));
+      await this.place.splats.add(name, head, parts.rows);
+    }
     this.place.touch(false);
     const { styles, from, to, wiping, amount } = this.stage;
     const fresh = !styles.some((style) => style.name === name);

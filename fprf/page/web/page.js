@@ -42,6 +42,14 @@ class Pictures {
 const MOST_SHOWN = 4; // photographs beside a style that is of several; by eye
 const SWEEP_MS = 4200; // that the line takes on its way across, once; by eye
 
+// One plain sentence on the stage, where it cannot be what it should be; without words there is none.
+const explain = (root, text = "") => {
+  root.querySelector(".why")?.remove();
+  root.dataset.why = text;
+  if (text) root.querySelector(".view").append(make("p", { className: "why", role: "status", textContent: text }));
+};
+const LOST = "The graphics card has dropped the picture. It comes back by itself; if it does not, reload the page.";
+
 // The controls of a stage: which style, from which other one, how far, or a line between both.
 class Stage {
   constructor(place, styles) {
@@ -172,7 +180,7 @@ const open = async (data) => {
   const styles = data.styles.map(({ name, of }) => ({ name, thumb: data.stills[name][0], of: of.map((each) => data.references[each]) })), root = at("place");
   const fall = (why) => {
     root.classList.add("pictures");
-    root.dataset.why = why;
+    explain(root, why && `${why[0].toUpperCase()}${why.slice(1)}. Pictures stand in the place of the scene.`);
     at("canvas").hidden = true;
     const count = Math.max(1, ...Object.values(data.stills).map((rows) => rows.length));
     for (const id of ["back", "next"]) at(id).hidden = count < 2;
@@ -196,6 +204,12 @@ const open = async (data) => {
   } else place = fall("");
   const stage = new Stage(place, styles.slice(0, 1));
   window.fprf = { place, stage };
+  if (place.splats) {
+    place.listeners.lost = (lost) => {
+      root.classList.toggle("drawn", !lost);
+      explain(root, lost ? LOST : "");
+    };
+  }
   if (place.splats) {
     // Other styles are read after the first picture; a page in the background draws none.
     await new Promise((done) => {

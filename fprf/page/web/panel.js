@@ -299,6 +299,10 @@ class Panel {
       const side = Math.min(MAX_PAINTED, by * Math.max(canvas.width, canvas.height));
       return this.savePainted({ camera: this.live.camera(), side, shown: stage.to, wipe: place.wipe }, name);
     }
+    if (place.lost) {
+      say(LOST, true);
+      return undefined;
+    }
     const most = Math.min(MAX_PICTURE, splats.gl.getParameter(splats.gl.MAX_TEXTURE_SIZE));
     const size = [canvas.width * by, canvas.height * by];
     if (Math.max(...size) > most) {
@@ -308,7 +312,7 @@ class Panel {
     wait("picture", `Drawing ${size.join(" × ")} pixels …`);
     await new Promise((done) => setTimeout(done, 50)); // the words come first
     [canvas.width, canvas.height] = size;
-    place.paint();
+    splats.draw(place.camera.view, place.lens, place.look, { near: place.scene.near, background: place.scene.background, exact: true });
     const blob = await new Promise((done) => canvas.toBlob(done));
     place.resize();
     place.touch();
