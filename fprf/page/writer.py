@@ -24,7 +24,7 @@ from ..io.maps import palette
 from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
 from ..scenes import Scene
-from ..splats.pinholes import camera_of
+from ..splats.pinholes import camera_of, covering
 from ..splats.scene import SplatScene
 from ..style.look import Restyle
 from . import css, read_asset, script
@@ -43,6 +43,12 @@ REFERENCE_PIXELS = 320
 """Longest side of references: as match maps, which lie beside them."""
 _MAX_PAGE_CAMERAS = 48
 """Captured cameras that one can go to, at most; by eye."""
+_MAX_SEEN_CAMERAS = 256
+"""Cameras that say what was photographed, at most; by eye: frames of neighbours overlap."""
+_PHOTOGRAPHS_FILL = 0.55
+"""How far a stage of another format is filled, from 0 (all of a photograph is seen) to 1 (nothing beyond it is);
+by eye. Views of captures show whole objects.
+"""
 _REACH_RATIO = 1.6
 """How far one may go from the middle of the cameras, relative to the farthest of them; by eye."""
 _REACH_DEPTHS = 0.5
@@ -192,7 +198,12 @@ def packed_scene(
         colours = packed.colours(each)
         styles.append(colour_header(colours))
         parts[f"style-{k}"] = colour_section(colours, level)
-    drawing = {"antialiased": scene.antialiased, "near": scene.near, "background": list(scene.background)}
+    drawing = {
+        "antialiased": scene.antialiased,
+        "near": scene.near,
+        "background": list(scene.background),
+        "fills": 0.0 if scene.poses is None else _PHOTOGRAPHS_FILL,
+    }
     place = about(scene.views, start, lambda view: _depth(scene, view))
     return packed, {**header(packed), **drawing, **place, "styles": styles}, parts
 
@@ -202,9 +213,7 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
     turns about.
     """
     # Evenly chosen cameras in their order, rotated so that the one to start from comes first.
-    others = sorted(
-        {*torch.linspace(0, len(cameras) - 1, min(_MAX_PAGE_CAMERAS, len(cameras))).round().long().tolist()}
-    )
+    others = _evenly(len(cameras), _MAX_PAGE_CAMERAS)
     chosen = [start, *(view for view in others if view > start), *(view for view in others if view < start)]
     depths = []
     for view in chosen:
@@ -222,7 +231,24 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
         "up": up.tolist(),
         "reach": {"centre": centre.tolist(), "radius": radius},
         "cameras": [_camera(cameras, view, far) for view, far in zip(chosen, depths, strict=True)],
+        "seen": [_frame(cameras, view) for view in _evenly(len(cameras), _MAX_SEEN_CAMERAS)],
     }
+
+
+def _evenly(count: int, most: int) -> list[int]:
+    """At most so many of `count` indices, in order."""
+    return torch.linspace(0, count - 1, min(most, count)).round().long().tolist()
+
+
+def _frame(cameras: Cameras, view: int) -> list[float]:
+    """Rows of a matrix [3 4] from a point of the world to (u z, v z, z), where u and v are in [0, 1] in the
+    frame, and the camera's place.
+    """
+    camera = covering(cameras, view, 0.0)
+    scaled = camera.intrinsics.double()
+    scaled[:2] /= torch.tensor([[camera.width], [camera.height]])
+    rows = scaled @ camera.world_to_camera[:3].double()
+    return [float(f"{x:.6g}") for x in [*rows.flatten().tolist(), *cameras.pose[view, :, 3].tolist()]]
 
 
 def _camera(cameras: Cameras, view: int, depth: float) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """Size of the photographs and number of Gaussians that a time on this machine is best used for.
 
-P pixels of a photograph, V training views, N Gaussians. On the machine that the constants were measured on a
-step takes A s P + B N, where s is the share of the full size's pixels that a step sees on average: the first
-steps see reduced ones. On a CUDA device with gsplat some steps are made to see what one takes there.
+P pixels of a photograph, V training views, N Gaussians. On the machine that the constants are meant for a step
+takes A s P + B N, where s is the share of the full size's pixels that it sees: the first steps see reduced
+ones. Where minutes are given each size has its share of the time, else of the steps. On a CUDA device with
+gsplat some steps are made to see what one takes there.
 
 Size counts first, the number of Gaussians second.
 """
@@ -25,12 +26,14 @@ if TYPE_CHECKING:
     from ..datamanagers.scene import ParsedScene
     from .config import GaussiansConfig
 
-# What a step takes on the machine of the constants, two x86-64 cores; fitted when the plan was made.
+# What a step takes on the machine of the constants, two x86-64 cores. Fitted to whole trainings of llff_fern at
+# 504x378 and llff_flower at 1008x756 with 60 000 Gaussians, on a machine of 1.47 times its speed: 12.1 and 22.6
+# ms a step of a time limit are expected, 11.0 and 20.3 were taken.
 
-_SECONDS_PER_PIXEL = 91e-9
+_SECONDS_PER_PIXEL = 75e-9
 """A."""
-_SECONDS_PER_GAUSSIAN = 103e-9
-"""B."""
+_SECONDS_PER_GAUSSIAN = 115e-9
+"""B: on that machine 62 to 93e-9, of 60 000 to a million (training_steps.json)."""
 _START_SECONDS = 6.0
 """Seconds before the first step, at least: reading photographs, first points; by eye."""
 
@@ -116,7 +119,8 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
         if budget is None:
             enough = steps * each <= _MAX_UNTIMED_SECONDS * times
         else:
-            enough = budget * times / each >= max(_MIN_STEPS, _MIN_PASSES * views)
+            within = budget * times * _steps_a_second(found, small, _MIN_PLANNED_GAUSSIANS)
+            enough = within >= max(_MIN_STEPS, _MIN_PASSES * views)
         smaller = math.floor(size) + 1
         if enough or config.downscale is not None or pixels / smaller**2 < _MIN_PIXELS:
             break
@@ -211,14 +215,27 @@ def _card_speed(device: torch.device) -> Callable[[float], float]:
 
 
 def _seconds(config: "GaussiansConfig", pixels: float, gaussians: int) -> float:
-    """Seconds of a step, on average, on the machine of the constants."""
+    """Seconds of a step, on average over the steps, on the machine of the constants."""
     return _SECONDS_PER_PIXEL * _share(config) * pixels + _SECONDS_PER_GAUSSIAN * gaussians
 
 
+def _steps_a_second(config: "GaussiansConfig", pixels: float, gaussians: int) -> float:
+    """Steps in a second, on average over the time, on the machine of the constants."""
+    steps = 0.0
+    for part, share in _sizes(config):
+        steps += part / (_SECONDS_PER_PIXEL * share * pixels + _SECONDS_PER_GAUSSIAN * gaussians)
+    return steps
+
+
 def _share(config: "GaussiansConfig") -> float:
-    """Share of the full size's pixels that a step sees on average."""
+    """Share of the full size's pixels that a step sees, on average over the steps."""
+    return sum(part * share for part, share in _sizes(config))
+
+
+def _sizes(config: "GaussiansConfig") -> tuple[tuple[float, float], ...]:
+    """Parts of the training, and the share of the full size's pixels that their steps see."""
     coarse = config.coarse
-    return (1 - coarse) + coarse * 2 / 3 / 4 + coarse / 3 / 16
+    return (coarse / 3, 1 / 16), (coarse * 2 / 3, 1 / 4), (1 - coarse, 1.0)
 
 
 def compile_kernels(device: torch.device, bands: int, say: Callable[[str], None]) -> None:

@@ -20,13 +20,13 @@ from fprf.splats.pinholes import camera_of
 from fprf.splats.scene import SplatScene
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
-DRAW = """async ([view, lens, width, height, look]) => {
+DRAW = """async ([view, lens, width, height, look, options]) => {
   const { splats, scene, canvas } = fprf.place;
   fprf.place.lost = true; // it shall not draw meanwhile, nor be sorting: the worker has one answer at a time
   while (fprf.place.sorting) await new Promise((done) => setTimeout(done, 5));
   await splats.sort(new Float32Array(view), scene.near);
   [canvas.width, canvas.height] = [width, height];
-  splats.draw(new Float32Array(view), lens, look, { near: scene.near, background: scene.background });
+  splats.draw(new Float32Array(view), lens, look, { near: scene.near, background: scene.background, ...options });
   const picture = canvas.toDataURL("image/png");
   fprf.place.lost = false;
   fprf.place.resize();
@@ -54,12 +54,14 @@ def opened(
     return page
 
 
-def drawn(page: Any, scene: SplatScene, view: int, look: dict[str, Any]) -> np.ndarray:
+def drawn(
+    page: Any, scene: SplatScene, view: int, look: dict[str, Any], wider: int = 0, **options: Any
+) -> np.ndarray:
+    """A view as the page draws it, `wider` by so many pixels on either side."""
     camera = camera_of(scene.cameras, view, scene.near)
-    lens = [float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    uri = page.evaluate(
-        DRAW, [camera.world_to_camera.T.flatten().tolist(), lens, camera.width, camera.height, look]
-    )
+    fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    place = [camera.world_to_camera.T.flatten().tolist(), [fx, fy, cx + wider, cy]]
+    uri = page.evaluate(DRAW, [*place, camera.width + 2 * wider, camera.height, look, options])
     return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), 1)[..., ::-1] / 255
 
 
@@ -303,3 +305,28 @@ def test_the_stage_fills_the_first_screen_whatever_the_format(
     picture = page.locator(".look > img").first.bounding_box()
     assert picture["width"] == 96
     assert page.locator(".look .of img").count() == 1, "the photograph beside the style that has one"
+
+
+def test_what_no_photograph_saw_fades_into_the_background(browser: Any, tmp_path: Path) -> None:
+    scene = inside(seen(street()))
+    scene = replace(scene, views=scene.views.select(torch.tensor([0, 0])))
+    page = opened(browser, written(tmp_path / "page.html", scene))
+    captured = {"first": "Captured", "blend": 0}
+    sky = {"background": [1.0, 1.0, 1.0], "rim": [1.0, 1.0, 1.0]}
+    plain = drawn(page, scene, 0, captured, 160, **sky)
+    faded = drawn(page, scene, 0, captured, 160, **sky, depth=10)
+    assert psnr(plain[20:-20, 190:290], faded[20:-20, 190:290]) > 35, "what the photograph shows stays"
+    assert plain[:, :140].mean() < 0.9 and faded[:, :140].min() > 0.98, "nothing is left of what it does not"
+    assert page.errors == []
+
+
+def test_the_background_is_a_gradient_of_the_theme(browser: Any, tmp_path: Path) -> None:
+    page = opened(browser, written(tmp_path / "page.html", seen(ball(2000, 1))))
+    light = pixels(page)
+    page.emulate_media(color_scheme="dark")
+    dark = pixels(page)
+    corner = np.s_[200:230, 4:30]  # below the title, above the styles
+    middle = np.s_[100:120, 4:30]
+    assert light[corner].mean() > 0.6 and dark[corner].mean() < 0.25
+    assert light[middle].std() > 0 and np.ptp(light[:, 5].mean(-1)) > 0.02
+    assert page.errors == []

@@ -312,7 +312,7 @@ class Panel {
     wait("picture", `Drawing ${size.join(" × ")} pixels …`);
     await new Promise((done) => setTimeout(done, 50)); // the words come first
     [canvas.width, canvas.height] = size;
-    splats.draw(place.camera.view, place.lens, place.look, { near: place.scene.near, background: place.scene.background, exact: true });
+    place.paint();
     const blob = await new Promise((done) => canvas.toBlob(done));
     place.resize();
     place.touch();

@@ -29,10 +29,12 @@ class Camera {
     return new Float32Array([r[0], d[0], f[0], 0, r[1], d[1], f[1], 0, r[2], d[2], f[2], 0, -dot(r, p), -dot(d, p), -dot(f, p), 1]);
   }
 
-  // fx fy cx cy for a canvas on which all of the photograph is to be seen.
-  fitted(width, height) {
-    const [w, h] = this.size, by = Math.min(width / w, height / h), [fx, fy, cx, cy] = this.lens;
-    return [fx * by, fy * by, width / 2 + (cx - w / 2) * by, height / 2 + (cy - h / 2) * by];
+  // fx fy cx cy for a canvas on which all of the photograph is to be seen: above a strip of such a share (`below`) and, the more
+  // it `fills`, the larger and the less of it: from 0 to 1, where nothing is seen but the photograph.
+  fitted(width, height, { below = 0, fills = 0 } = {}) {
+    const [w, h] = this.size, free = height * Math.max(1 - below, 0.5), [fx, fy, cx, cy] = this.lens;
+    const by = Math.min(width / w, free / h) ** (1 - fills) * Math.max(width / w, free / h) ** fills;
+    return [fx * by, fy * by, width / 2 + (cx - w / 2) * by, free / 2 + (cy - h / 2) * by];
   }
 
   copy() { return Object.assign(Object.create(Camera.prototype), this, { axes: this.axes.map((a) => [...a]), place: [...this.place] }); }
@@ -77,7 +79,8 @@ class Place {
     this.flight = null;
     this.listeners = { pick: null, drawn: null };
     this.controls();
-    new ResizeObserver(() => this.resize()).observe(canvas);
+    const sizes = new ResizeObserver(() => this.resize());
+    for (const each of [canvas, canvas.parentElement.querySelector(".bar")]) if (each) sizes.observe(each);
     if (splats) {
       canvas.addEventListener("webglcontextlost", (event) => {
         event.preventDefault();
@@ -92,6 +95,9 @@ class Place {
         this.listeners.lost?.(false);
       });
     }
+    this.fading = true; // what no photograph saw, into the background
+    this.readSky();
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.readSky());
     this.resize();
     requestAnimationFrame((now) => this.frame(now));
   }
@@ -99,12 +105,15 @@ class Place {
   resize() {
     const box = this.canvas.getBoundingClientRect(), by = Math.min(window.devicePixelRatio || 1, 2, EDGE / Math.max(box.width, box.height, 1));
     const size = [box.width, box.height].map((side) => Math.max(1, Math.round(side * by)));
+    const bar = this.canvas.parentElement.querySelector(".bar")?.getBoundingClientRect(); // styles lie over the stage
+    const below = bar?.height && box.height ? Math.max(0, box.bottom - bar.top) / box.height : 0;
+    if (below !== this.below) { this.below = below; this.touch(); }
     if (size[0] === this.canvas.width && size[1] === this.canvas.height) return;
     [this.canvas.width, this.canvas.height] = size;
     this.touch();
   }
 
-  get lens() { return this.camera.fitted(this.canvas.width, this.canvas.height); }
+  get lens() { return this.camera.fitted(this.canvas.width, this.canvas.height, { below: this.below, fills: this.scene.fills }); }
   get look() { return { first: this.first ?? this.second, second: this.second ?? this.first, blend: this.blend, wipe: this.wipe }; }
 
   // Something else is to be seen: `moved` where the camera is another one.
@@ -162,12 +171,25 @@ class Place {
     this.changed = false;
     this.exact = rest;
     const start = performance.now();
-    this.splats.draw(this.camera.view, this.lens, this.look, { near: this.scene.near, background: this.scene.background, share, exact: rest });
+    this.paint({ share, exact: rest });
     this.wait(() => {
       if (!rest) this.full = 0.5 * (this.full || (performance.now() - start) / share ** 2) + 0.5 * (performance.now() - start) / share ** 2;
       this.milliseconds = performance.now() - start;
       this.listeners.drawn?.(rest);
     });
+  }
+
+  // Draw what is to be seen into the canvas, over the page's own background.
+  paint({ share = 1, exact = true } = {}) {
+    const { near, cameras } = this.scene, [background, rim] = this.sky;
+    this.splats.draw(this.camera.view, this.lens, this.look, { near, background, rim, depth: this.fading ? cameras[0].depth : 0, share, exact });
+  }
+
+  // Colours behind all things, in the middle and at the rim: those of the page's theme.
+  readSky() {
+    const style = getComputedStyle(this.canvas);
+    this.sky = ["--near-sky", "--far-sky"].map((name) => style.getPropertyValue(name).trim().match(/[0-9a-f]{2}/gi).map((pair) => parseInt(pair, 16) / 255));
+    this.touch(false);
   }
 
   // Until the graphics card has drawn: frames never queue.

@@ -8,6 +8,12 @@
 
 const WIDTH = 2048; // texels a row
 const MANY = 1024; // quads of an instance: one quad each costs software, and most cards, more than what it covers
+const COARSE = 8; // pixels a side of what is found out about depths: the edges that they make are soft
+const EVERY = 2; // of the Gaussians, one is asked for its depth
+const SEEN_BY = 3; // photographs that shall have seen a thing, where so many were taken around here
+const BORDER = 0.12; // of a frame's side, within which it counts less; by eye
+const AROUND = 0.4; // how far from here photographs count, in the distance of what they look at; by eye
+const FARTHEST = 1.5; // beyond so many of these distances nothing is told apart: through gaps one sees what nobody photographed
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 `;
@@ -21,7 +27,7 @@ uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform float near, ble
 uniform int bands; uniform bool depth; uniform bool sharp;
 layout(location = 0) in uint index;
 flat out uvec4 place; // bits of the floats: centre in the picture, longer half axis at one standard deviation
-flat out uvec4 look;  // half floats: colour, opacity; shorter half axis over the longer, how many deviations the quad reaches; 0
+flat out uvec4 look;  // half floats: colour, opacity; shorter half axis over the longer, how many deviations the quad reaches; depth
 ivec2 texel(int i) { return ivec2(i % ${WIDTH}, i / ${WIDTH}); }
 vec3 shaded(vec4 texel4, mat4 range, sampler2D maps, vec3 rest) {
   vec3 mean = range[0].xyz + texel4.rgb * range[1].xyz;
@@ -70,7 +76,8 @@ void main() {
   if (any(lessThan(centre + half_, vec2(0.))) || any(greaterThan(centre - half_, size))) return;
   place = floatBitsToUint(vec4(centre, sqrt(l1) * axis));
   uint wide = packHalf2x16(vec2(sqrt(l2 / l1), sqrt(reach)));
-  if (depth) { float far = min(p.z, 65504.); look = uvec4(packHalf2x16(vec2(far)), packHalf2x16(vec2(far, alpha)), wide, 0u); return; }
+  uint far = packHalf2x16(vec2(min(p.z, 65504.)));
+  if (depth) { look = uvec4(far, packHalf2x16(vec2(min(p.z, 65504.), alpha)), wide, far); return; }
   vec3 rest = vec3(0.);
   if (bands > 1) {
     vec3 d = normalize(mean - eye);
@@ -85,16 +92,16 @@ void main() {
   float m = wipe >= 0. ? step(wipe * size.x, centre.x) : blend;
   vec3 shown = m < 1. ? shaded(texelFetch(first, texel(int(index)), 0), range0, maps0, rest) : vec3(0.);
   if (m > 0.) shown = mix(shown, shaded(texelFetch(second, texel(int(index)), 0), range1, maps1, rest), m);
-  look = uvec4(packHalf2x16(shown.rg), packHalf2x16(vec2(shown.b, alpha)), wide, 0u);
+  look = uvec4(packHalf2x16(shown.rg), packHalf2x16(vec2(shown.b, alpha)), wide, far);
 }`;
 const NOTHING = `${COMMON}void main() {}`;
 const QUAD = `${COMMON}
-uniform vec2 size; uniform usampler2D projected; uniform int kept;
+uniform vec2 size; uniform usampler2D projected; uniform int kept, every; uniform bool deep;
 out vec2 at; flat out vec4 colour;
 void main() {
   gl_Position = vec4(2., 2., 2., 1.);
   at = vec2(0.); colour = vec4(0.);
-  int i = gl_InstanceID * ${MANY} + (gl_VertexID >> 2); // four vertices a quad
+  int i = (gl_InstanceID * ${MANY} + (gl_VertexID >> 2)) * every; // four vertices a quad
   if (i >= kept) return;
   ivec2 from = ivec2(i % ${WIDTH / 2} * 2, i / ${WIDTH / 2});
   uvec4 a = texelFetch(projected, from, 0), b = texelFetch(projected, from + ivec2(1, 0), 0);
@@ -104,6 +111,7 @@ void main() {
   gl_Position = vec4(2. * px / size - 1., 0., 1.);
   at = reach * .84932180; // exp(-x^2 / 2) = exp2(-(.849 x)^2)
   colour = vec4(unpackHalf2x16(b.x), unpackHalf2x16(b.y));
+  if (deep) colour.rgb = unpackHalf2x16(b.w).xxx;
 }`;
 const FRAGMENT = `${COMMON}
 in vec2 at; flat in vec4 colour; out vec4 o;
@@ -113,12 +121,36 @@ void main() {
   o = vec4(colour.rgb * a, a);
 }`;
 const FULL = `${COMMON}void main() { gl_Position = vec4(float(gl_VertexID & 1) * 4. - 1., float(gl_VertexID >> 1) * 4. - 1., -1., 1.); }`;
-const SHOW = `${COMMON}
-uniform sampler2D picture; uniform vec2 scale; uniform float height; uniform vec3 background; out vec4 o;
+// How well photographs that were taken around here saw what a pixel shows: of the point at its depth, in how many of their frames
+// it lies, and how far within.
+const COVER = `${COMMON}
+uniform sampler2D depths, seen; uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform vec3 eye;
+uniform float farthest, nearest, around, needed; uniform int frames; out vec4 o;
 void main() {
-  vec2 at = vec2(gl_FragCoord.x, height - gl_FragCoord.y) * scale;
-  vec4 c = texture(picture, at / vec2(textureSize(picture, 0)));
-  o = vec4(c.rgb + (1. - c.a) * background, 1.);
+  vec4 d = texelFetch(depths, ivec2(gl_FragCoord.xy), 0);
+  float far = d.a > .02 ? min(d.r / d.a, farthest) : farthest;
+  vec2 at = gl_FragCoord.xy / vec2(textureSize(depths, 0)) * size;
+  vec4 point = vec4(eye + far * (transpose(mat3(view)) * vec3((at - lens.zw) / lens.xy, 1.)), 1.);
+  float sum = 0.;
+  for (int k = 0; k < frames && sum < needed; k++) {
+    vec3 f = vec3(dot(texelFetch(seen, ivec2(0, k), 0), point), dot(texelFetch(seen, ivec2(1, k), 0), point), dot(texelFetch(seen, ivec2(2, k), 0), point));
+    vec2 within = clamp(min(f.xy / f.z, 1. - f.xy / f.z) / ${BORDER}, 0., 1.);
+    float apart = max(0., distance(eye, texelFetch(seen, ivec2(3, k), 0).xyz) - nearest) / around;
+    if (f.z > 0.) sum += within.x * within.y * exp(-apart * apart);
+  }
+  o = vec4(smoothstep(0., 1., sum / needed));
+}`;
+const SHOW = `${COMMON}
+uniform sampler2D picture, cover; uniform vec2 scale, whole; uniform float height; uniform vec3 background, rim; uniform bool faded; out vec4 o;
+void main() {
+  vec2 at = vec2(gl_FragCoord.x, height - gl_FragCoord.y);
+  vec4 c = texture(picture, at * scale / vec2(textureSize(picture, 0)));
+  if (faded) c *= texture(cover, at / whole).r;
+  // The background: lighter behind the middle of the picture; eight bits would show its steps without the noise.
+  float away = smoothstep(0., 1.1, length((at / whole - vec2(.5, .42)) * vec2(1.1, 1.3)));
+  float noise = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(.06711056, .00583715)))) - .5;
+  vec3 behind = background == rim ? background : mix(background, rim, away) + noise / 255.;
+  o = vec4(c.rgb + (1. - c.a) * behind, 1.);
 }`;
 
 // Runs in a worker: a 16-bit counting sort by depth, nearest first, of what lies before the camera. Bits of a positive float
@@ -202,7 +234,8 @@ class Splats {
     this.software = /swiftshader|llvmpipe|software/i.test(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     const whole = floats && this.software && gl.getExtension("EXT_float_blend") && gl.getExtension("OES_texture_float_linear");
     this.formats = { exact: whole ? gl.RGBA32F : floats ? gl.RGBA16F : gl.RGBA8, coarse: whole ? gl.RGBA32F : gl.RGBA8 };
-    this.programs = { project: this.link(VERTEX, NOTHING, ["place", "look"]), splat: this.link(QUAD, FRAGMENT), show: this.link(FULL, SHOW) };
+    this.programs = { project: this.link(VERTEX, NOTHING, ["place", "look"]), splat: this.link(QUAD, FRAGMENT), cover: this.link(FULL, COVER), show: this.link(FULL, SHOW) };
+    this.deep = Boolean(floats); // else there is no place for depths
   }
 
   // Textures and buffers of what was loaded.
@@ -234,7 +267,9 @@ class Splats {
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.bindVertexArray(null);
     this.feedback = gl.createTransformFeedback();
-    this.exact = this.coarse = null;
+    const seen = Float32Array.from((this.head.seen ?? []).flatMap((frame) => [...frame, 0])); // three rows and a place
+    this.textures.seen = this.texture(seen.length ? seen : new Float32Array(16), gl.RGBA32F, gl.RGBA, gl.FLOAT, 4);
+    this.targets = {};
     this.styles.clear();
     for (const [name, style] of this.colours) this.upload(name, style);
     if (this.order) this.put();
@@ -321,41 +356,75 @@ class Splats {
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.order, 0, this.kept);
   }
 
-  // A picture to draw into; `exact` ones hold floats.
-  frame(width, height, exact) {
-    const gl = this.gl, kind = exact && this.formats.exact !== this.formats.coarse ? "exact" : "coarse";
-    if (this[kind]?.width === width && this[kind].height === height) return this[kind];
-    if (this[kind]) { gl.deleteTexture(this[kind].picture); gl.deleteFramebuffer(this[kind].buffer); }
+  // A picture to draw into: `exact` ones and `depth` hold floats.
+  frame(width, height, kind) {
+    const gl = this.gl, before = this.targets[kind];
+    if (before?.width === width && before.height === height) return before;
+    if (before) { gl.deleteTexture(before.picture); gl.deleteFramebuffer(before.buffer); }
     const picture = gl.createTexture(), buffer = gl.createFramebuffer();
     gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, this.formats[kind], width, height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, { ...this.formats, depth: this.formats.exact, cover: gl.RGBA8 }[kind], width, height);
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
     for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, picture, 0);
-    return this[kind] = { width, height, picture, buffer };
+    return this.targets[kind] = { width, height, picture, buffer };
   }
 
   // Draw into the canvas at a share of its resolution. `look`: first and second style, blend in [0, 1], wipe in [0, 1] or -1.
-  draw(view, lens, look, { near = 0.01, background = [0, 0, 0], share = 1, exact = true } = {}) {
+  // `background` becomes `rim` away from the middle; what no photograph saw fades where `depth` is given, the distance of what they
+  // look at.
+  draw(view, lens, look, { near = 0.01, background = [0, 0, 0], rim = background, depth = 0, share = 1, exact = true } = {}) {
     const gl = this.gl, { width, height } = this.canvas;
     const small = [Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height))];
-    const scale = [small[0] / width, small[1] / height];
-    const target = this.frame(...small, exact);
-    this.splat(target, view, [lens[0] * scale[0], lens[1] * scale[1], lens[2] * scale[0], lens[3] * scale[1]], look, near, null);
+    const scale = [small[0] / width, small[1] / height], scaled = [lens[0] * scale[0], lens[1] * scale[1], lens[2] * scale[0], lens[3] * scale[1]];
+    const target = this.frame(...small, exact && this.formats.exact !== this.formats.coarse ? "exact" : "coarse");
+    this.splat(target, view, scaled, look, near, null);
+    const faded = Boolean(depth && this.deep && this.head.seen?.length);
+    const cover = faded ? this.cover(target, view, scaled, depth) : target;
     const { program, places } = this.programs.show;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     gl.disable(gl.BLEND);
     gl.useProgram(program);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, target.picture);
+    [target, cover].forEach(({ picture }, i) => { gl.activeTexture(gl.TEXTURE0 + i); gl.bindTexture(gl.TEXTURE_2D, picture); });
     gl.uniform1i(places.picture, 0);
+    gl.uniform1i(places.cover, 1);
+    gl.uniform1i(places.faded, faded ? 1 : 0);
     gl.uniform2f(places.scale, ...scale);
+    gl.uniform2f(places.whole, width, height);
     gl.uniform1f(places.height, height);
     gl.uniform3f(places.background, ...background);
+    gl.uniform3f(places.rim, ...rim);
     gl.bindVertexArray(this.quads);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // How well photographs saw what was just drawn into a target, on a coarse grid.
+  cover(target, view, lens, depth) {
+    const eye = eyeOf(view), apart = this.head.seen.map((frame) => Math.hypot(...eye.map((x, i) => x - frame[12 + i])));
+    const nearest = Math.min(...apart), around = AROUND * (depth + nearest);
+    const about = apart.reduce((sum, each) => sum + Math.exp(-(((each - nearest) / around) ** 2)), 0);
+    const gl = this.gl, sides = [target.width, target.height].map((side) => Math.max(1, Math.ceil(side / COARSE)));
+    const depths = this.frame(...sides, "depth"), found = this.frame(...sides, "cover");
+    this.quadded(depths, [target.width, target.height], EVERY, true);
+    const { program, places } = this.programs.cover;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, found.buffer);
+    gl.disable(gl.BLEND);
+    gl.useProgram(program);
+    [depths.picture, this.textures.seen].forEach((texture, i) => { gl.activeTexture(gl.TEXTURE0 + i); gl.bindTexture(gl.TEXTURE_2D, texture); });
+    gl.uniform1i(places.depths, 0);
+    gl.uniform1i(places.seen, 1);
+    gl.uniform1i(places.frames, this.head.seen.length);
+    gl.uniformMatrix4fv(places.view, false, view);
+    gl.uniform4f(places.lens, ...lens);
+    gl.uniform2f(places.size, target.width, target.height);
+    gl.uniform3f(places.eye, ...eye);
+    const floats = { farthest: nearest + FARTHEST * depth, nearest, around, needed: Math.min(SEEN_BY, about) };
+    for (const [name, value] of Object.entries(floats)) gl.uniform1f(places[name], value);
+    gl.bindVertexArray(this.quads);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    return found;
   }
 
   // Draw into a target, or, into one pixel of it, depths in the place of colours.
@@ -381,8 +450,7 @@ class Splats {
     gl.uniform1i(places.bands, Math.round(Math.sqrt(this.head.harmonics)));
     gl.uniform1i(places.depth, pixel ? 1 : 0);
     gl.uniform1i(places.sharp, this.head.antialiased ? 1 : 0);
-    // The camera's place: -R^T t.
-    gl.uniform3f(places.eye, ...[0, 1, 2].map((i) => -(view[4 * i] * view[12] + view[4 * i + 1] * view[13] + view[4 * i + 2] * view[14])));
+    gl.uniform3f(places.eye, ...eyeOf(view));
     gl.bindVertexArray(this.ordered);
     gl.enable(gl.RASTERIZER_DISCARD);
     gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, this.feedback);
@@ -400,33 +468,46 @@ class Splats {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, Math.ceil(this.kept / (WIDTH / 2)), gl.RGBA_INTEGER, gl.UNSIGNED_INT, 0);
     gl.bindBuffer(gl.PIXEL_UNPACK_BUFFER, null);
 
-    const drawn = this.programs.splat;
+    this.quadded(target, [target.width, target.height], 1, false, pixel);
+  }
+
+  // Draw one of `every` so many projected Gaussians into a target, or into one pixel of it: colours, or `deep` their depths.
+  // `size` is that of the picture that they were projected for.
+  quadded(target, size, every, deep, pixel = null) {
+    const gl = this.gl, { program, places } = this.programs.splat;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
     if (pixel) { gl.enable(gl.SCISSOR_TEST); gl.scissor(...pixel, 1, 1); }
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.useProgram(drawn.program);
-    gl.uniform2f(drawn.places.size, target.width, target.height);
-    gl.uniform1i(drawn.places.projected, 0);
-    gl.uniform1i(drawn.places.kept, this.kept);
+    gl.useProgram(program);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.textures.projected);
+    gl.uniform2f(places.size, ...size);
+    gl.uniform1i(places.projected, 0);
+    gl.uniform1i(places.kept, this.kept);
+    gl.uniform1i(places.every, every);
+    gl.uniform1i(places.deep, deep ? 1 : 0);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
     gl.bindVertexArray(this.quads);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * MANY, gl.UNSIGNED_SHORT, 0, Math.ceil(this.kept / MANY));
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * MANY, gl.UNSIGNED_SHORT, 0, Math.ceil(this.kept / (MANY * every)));
     gl.bindVertexArray(null);
     gl.disable(gl.SCISSOR_TEST);
   }
 
   // Depth along the camera's axis at a pixel of the canvas, the mean by weight; null where there is nothing to see.
   pick(view, lens, look, x, y, near = 0.01) {
-    const gl = this.gl, target = this.frame(this.canvas.width, this.canvas.height, true), pixel = [Math.floor(x), Math.floor(y)];
+    const gl = this.gl, target = this.frame(this.canvas.width, this.canvas.height, this.formats.exact === this.formats.coarse ? "coarse" : "exact"), pixel = [Math.floor(x), Math.floor(y)];
     this.splat(target, view, lens, look, near, pixel);
     const found = new Float32Array(4);
     gl.readPixels(...pixel, 1, 1, gl.RGBA, gl.FLOAT, found);
     return found[3] > 0.3 ? found[0] / found[3] : null;
   }
 }
+
+// The place of a camera, -R^T t, by its world-to-camera matrix.
+const eyeOf = (view) => [0, 1, 2].map((i) => -(view[4 * i] * view[12] + view[4 * i + 1] * view[13] + view[4 * i + 2] * view[14]));
 
 const decodedMeans = (shape, chunks, count) => {
   const means = new Float32Array(3 * count);
