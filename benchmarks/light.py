@@ -31,7 +31,7 @@ from fprf.style.scene_style import Membership
 
 from .common import SHARED
 from .halves import METHODS, Image, Judged, half_reference, judge_pair, report_halves
-from .single_image import encoded, flat_look, flat_scene, render_flat
+from .single_image import encoded, flat_landmarks, flat_look, flat_scene, render_flat
 
 _THUMBNAIL_PIXELS = 32
 """Longer side at which lights are compared."""
@@ -100,7 +100,14 @@ def judge_camera(paths: Sequence[Path], semantic: Encoder, config: LightConfig, 
     for seed in config.seeds:
         flat = flat_scene(plain.flatten(0, 1), features, size, regions=_REGIONS, seed=seed)
         encoders = Encoders(
-            ColourEncoder(), semantic, basis, flat.style, longest=max(size), guided=guided, seed=seed
+            ColourEncoder(),
+            semantic,
+            basis,
+            flat.style,
+            longest=max(size),
+            guided=guided,
+            seed=seed,
+            landmarks=flat_landmarks(plain, features),
         )
         belongs = Membership(flat.style.keys, flat.style.semantic_mean)(features).view(*size, -1)
         for other in others:

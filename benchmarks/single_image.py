@@ -21,6 +21,8 @@ from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.light import light_of
 from fprf.style.look import Restyle, colour_maps, decoded_colours, region_maps
+from fprf.style.placed_light import placed_light
+from fprf.style.placing import VIEW_SAMPLES, Landmarks, ViewSamples, blurred, view_keypoints
 from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.types import Want
 
@@ -93,19 +95,17 @@ def flat_look(
     device = flat.content.device
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     light = None
+    placed = None
+    everywhere = torch.ones(len(flat.style.share), len(dictionary.names)).bool()
     if config.light:
+        placed = placed_light(flat.style, dictionary, everywhere)
         own = decoded_colours(stylizer, flat.style, decoder, features=0.0)
         light = light_of(flat.style, dictionary, config, own, bold=bold)
         light = None if light is None else light.to(device)
     if decoder is None:
-        maps = region_maps(
-            stylizer,
-            dictionary,
-            flat.style,
-            config,
-            torch.ones(len(flat.style.share), len(dictionary.names)).bool(),
-        )
-        return Restyle(stylizer, features=config.features if maps is None else 0.0, colours=maps, light=light)
+        maps = region_maps(stylizer, dictionary, flat.style, config, everywhere)
+        features = config.features if maps is None else 0.0
+        return Restyle(stylizer, features=features, colours=maps, light=light, placed=placed)
     smoothing = config.smoothing(flat.style)
     colours = colour_maps(
         stylizer,
@@ -121,7 +121,17 @@ def flat_look(
         features=config.features,
         colours=None if colours is None else colours.to(device),
         light=light,
+        placed=None if placed is None else placed.to(device),
     )
+
+
+def flat_landmarks(image: Annotated[Tensor, "H W 3"], semantic: Annotated[Tensor, "N D"]) -> Landmarks:
+    """The picture as the only view by which photographs of the very place are told."""
+    height, width = image.shape[:2]
+    at = torch.arange(0, height * width, max(1, height * width // VIEW_SAMPLES))
+    pixel = torch.stack([at % width, at // width], 1) + 0.5
+    samples = ViewSamples(pixel, blurred(image).flatten(0, 1)[at], semantic[at])
+    return Landmarks((view_keypoints(image),), lambda view: samples)
 
 
 @torch.no_grad()

@@ -103,6 +103,18 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     belongs = None
     if part.light is not None:
         belongs = part.light.membership(semantic)
+    matched = _matched(part, semantic, belongs)
+    if part.placed is None:
+        return matched
+    measured = part.placed(semantic, belongs)
+    both: Tensor = (1 - measured.share[..., None]) * matched + measured.maps
+    return both
+
+
+def _matched(
+    part: Restyle, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None
+) -> Annotated[Tensor, "N 4 3"]:
+    """A and b of what is matched. `belongs` is the membership, where it is known."""
     if part.colours is not None:
         maps = part.colours
         share: Tensor = maps.membership(semantic) if belongs is None else belongs

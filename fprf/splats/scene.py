@@ -23,13 +23,14 @@ from ..rendering.renderer import enlarged
 from ..scenes import Scene, SceneView, Values
 from ..style.dictionary import Encoders
 from ..style.look import Restyle
+from ..style.placing import VIEW_SAMPLES, Landmarks, ViewSamples, blurred
 from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
-from .pinholes import cover, distorted
+from .pinholes import camera_of, cover, distorted
 from .relighting import Illumination, find_illumination, mixed_gain, relit_harmonics
 from .restyle import ColourEncoder, restyled_harmonics
 from .semantics import Semantics
@@ -39,6 +40,8 @@ _PAINTED_GAUSSIANS = 1 << 14
 """Gaussians whose values are found at a time: bounds the memory."""
 _PAINTED_CHANNELS = 128
 """Channels that are drawn at a time: bounds the memory."""
+_MIN_SAMPLE_OPACITY = 0.1
+"""Pixels less opaque than this show nothing of the scene; by eye."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +288,38 @@ class SplatScene(Scene):
         missing.
         """
         found = self.found()
-        return Encoders(ColourEncoder(), self.encoder(), found.basis, found.style, longest=self.longest)
+        return Encoders(
+            ColourEncoder(),
+            self.encoder(),
+            found.basis,
+            found.style,
+            longest=self.longest,
+            landmarks=self._landmarks(),
+        )
+
+    def _landmarks(self) -> Landmarks | None:
+        """What tells photographs of the very place; None where nobody looked."""
+        found = self.found()
+        seen = found.seen
+        if seen is None:
+            return None
+
+        @torch.inference_mode()
+        def samples(view: int) -> ViewSamples:
+            """Colours and semantics of a view as captured, at even steps through what is solid."""
+            camera = camera_of(seen.cameras, view, self.near)
+            features = found.features.float()
+            drawn = draw(self.gaussians, camera, antialiased=self.antialiased, features=features)
+            opacity = drawn.opacity[..., None]
+            behind = (1 - opacity) * torch.tensor(self.background)
+            colour = blurred((drawn.image + behind).clamp(0, 1)).flatten(0, 1)
+            semantic = (drawn.features / opacity.clamp_min(_MIN_SAMPLE_OPACITY)).flatten(0, 1)
+            at = (drawn.opacity.flatten() > _MIN_SAMPLE_OPACITY).nonzero()[:, 0]
+            at = at[:: max(1, len(at) // VIEW_SAMPLES)]
+            pixel = torch.stack([at % camera.width, at // camera.width], 1) + 0.5
+            return ViewSamples(pixel, colour[at], semantic[at])
+
+        return Landmarks(seen.keypoints, samples)
 
 
 def illuminated(scene: SplatScene) -> Illumination:

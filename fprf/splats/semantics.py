@@ -16,6 +16,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields
 from typing import Annotated, NamedTuple, TypeVar
 
 import torch
@@ -30,6 +31,7 @@ from ..ops.config import GuidedConfig
 from ..ops.guided import upsample
 from ..ops.rasterise.rendering import lift
 from ..rendering.cameras import Cameras
+from ..style.placing import Keypoints, keypoint_tensors, keypoints_from, view_keypoints
 from ..style.scene_style import SceneStyle, region_contacts, scene_style
 from ..style.scene_style import from_tensors as style_from
 from ..style.scene_style import to_tensors as style_tensors
@@ -63,6 +65,13 @@ _MAX_VIEWS_AT_ONCE = 4
 _Result = TypeVar("_Result")
 
 
+class SeenViews(NamedTuple):
+    """Views that semantics were gathered from, and their keypoints."""
+
+    cameras: Cameras
+    keypoints: tuple[Keypoints, ...]
+
+
 class Semantics(NamedTuple):
     """Semantics of N Gaussians, gathered from views."""
 
@@ -72,6 +81,8 @@ class Semantics(NamedTuple):
     """Half precision."""
     encoder: str
     """Identity of the encoder."""
+    seen: SeenViews | None = None
+    """By what photographs of the very place are told; None of what an earlier version found."""
 
 
 class _Picture(NamedTuple):
@@ -81,6 +92,7 @@ class _Picture(NamedTuple):
     """Colours times opacity."""
     opacity: Annotated[Tensor, "H W"]
     maps: Annotated[Tensor, "C h w"]
+    keypoints: Keypoints
 
 
 @torch.inference_mode()
@@ -106,7 +118,7 @@ def find_semantics(
         camera = camera_of(cameras, view, near)
         drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
         maps = encoder.cutout(drawn.image.permute(2, 0, 1)[None], drawn.opacity[None])[0].float()
-        return _Picture(drawn.image, drawn.opacity, maps)
+        return _Picture(drawn.image, drawn.opacity, maps, view_keypoints(drawn.image))
 
     pictures = []
     solid = []
@@ -138,7 +150,7 @@ def find_semantics(
         Samples are colours, features and opacities of some pixels, and colours and features of both ends of
         pairs [P 2 3+D].
         """
-        image, opacity, maps = pictures[view]
+        image, opacity, maps, _ = pictures[view]
         width, height = reduced.size[view].tolist()
         layers = torch.cat([image, opacity[..., None]], 2)
         coarse = interpolate(layers.permute(2, 0, 1)[None], (height, width), mode="area")[0].permute(1, 2, 0)
@@ -194,7 +206,8 @@ def find_semantics(
     sums *= _FEATURE_REDUCTION**2
     weights *= _FEATURE_REDUCTION**2
     features = _spread(gaussians.means, sums, weights, style.semantic_mean)
-    return Semantics(style, basis, features, encoder.identity)
+    views = SeenViews(cameras, tuple(picture.keypoints for picture in pictures))
+    return Semantics(style, basis, features, encoder.identity, views)
 
 
 def _in_threads(function: Callable[[int], _Result], count: int) -> Iterator[_Result]:
@@ -278,6 +291,12 @@ def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
     for group, tensors in parts.items():
         for name, tensor in tensors.items():
             named[f"{group}.{name}"] = tensor
+    if found.seen is not None:
+        for field in fields(Cameras):
+            # A file has the views of a capture twice; tensors in it must not share memory.
+            named[f"seen.{field.name}"] = getattr(found.seen.cameras, field.name).clone()
+        for name, tensor in keypoint_tensors(found.seen.keypoints).items():
+            named[f"keypoints.{name}"] = tensor
     return {
         **named,
         "semantic": found.features,
@@ -299,7 +318,12 @@ def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
         raise CheckpointError(
             f"what is known of a capture has features {tuple(features.shape)}; it is of another one"
         )
-    return Semantics(style_from(tensor_group(tensors, "style")), basis, features.half(), encoder)
+    style = style_from(tensor_group(tensors, "style"))
+    keypoints = keypoints_from(tensor_group(tensors, "keypoints"))
+    seen = None
+    if keypoints:
+        seen = SeenViews(Cameras(**tensor_group(tensors, "seen")), keypoints)
+    return Semantics(style, basis, features.half(), encoder, seen)
 
 
 def tensor_group(tensors: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -31,6 +31,7 @@ from ..io.atomic import write_bytes
 from ..ops.backend import double, float32_convolutions
 from ..ops.config import GuidedConfig
 from ..ops.guided import apply, coefficients
+from .placing import Landmarks, Pairs, find_place
 from .statistics import covariance, group_moments, kmeans, mix, moments
 
 if TYPE_CHECKING:
@@ -80,6 +81,8 @@ class Encoders(NamedTuple):
     """The filter that features of the scene's own images passed."""
     seed: int = 0
     """Of the clusters of a style dictionary."""
+    landmarks: Landmarks | None = None
+    """What tells photographs of the very place; None = nobody looks."""
 
 
 class Reference(NamedTuple):
@@ -97,6 +100,8 @@ class Reference(NamedTuple):
     """Squared length that semantics lose by projection on the scene's basis (`Basis.beyond`): large for what
     the scene does not show. None = 0.
     """
+    placed: Pairs | None = None
+    """Colours of the scene and of the photograph at the very place; None where it shows another."""
 
 
 @torch.inference_mode()
@@ -119,7 +124,8 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path |
     if encoders.semantic is None or encoders.basis is None:
         return Reference(name, content, content.new_zeros(len(content), 0), colour=colour)
     semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
-    return Reference(name, content, semantic, colour=colour, beyond=beyond)
+    placed = None if encoders.landmarks is None else find_place(encoders.landmarks, image, chosen)
+    return Reference(name, content, semantic, colour=colour, beyond=beyond, placed=placed)
 
 
 def _encoded_size(photo: Image, longest: int) -> tuple[int, int]:
@@ -272,6 +278,8 @@ class StyleDictionary(NamedTuple):
     """The encoder's zero, projected on the scene's semantic basis; None = 0. Not saved: it follows from the
     basis.
     """
+    placed: tuple[Pairs | None, ...] = ()
+    """Colours at the very place, of each reference that shows it; () = nobody looked. Not saved."""
 
 
 def build_dictionary(
@@ -330,7 +338,10 @@ def concatenate(
         tables[name] = torch.cat([getattr(part, name) for part in parts])
     tables["weight"] = torch.tensor(weights, dtype=torch.float32).repeat_interleave(counts)
     reference = torch.arange(len(parts)).repeat_interleave(counts)
-    return StyleDictionary(**tables, reference=reference, names=tuple(names), blend=parts[0].blend)
+    placed = tuple(part.placed[0] if part.placed else None for part in parts)
+    return StyleDictionary(
+        **tables, reference=reference, names=tuple(names), blend=parts[0].blend, placed=placed
+    )
 
 
 def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDictionary:
@@ -366,6 +377,7 @@ def _codes_of(r: Reference, clusters: int, blend: float, seed: int) -> StyleDict
         reference=torch.zeros(len(keys), dtype=torch.int64),
         names=(r.name,),
         blend=float(blend),
+        placed=(r.placed,),
     )
 
 
@@ -432,6 +444,7 @@ def choose(
         reference=renumbered[d.reference[codes]],
         names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
         allowed=None,
+        placed=tuple(d.placed[i] for i in references.nonzero()[:, 0].tolist() if d.placed),
     )
     return part, codes
 

@@ -61,7 +61,7 @@ _MAX_SOURCE_ROUGHNESS = 0.12
 """Deviation of luma, relative to it, up to which a region is a source of light: skies lie below, by eye."""
 _MIN_THING_ROUGHNESS = 0.25
 """The same from which on it is a thing: façades and trees lie above, by eye."""
-_BLACK_OFFSET = 0.02
+BLACK_OFFSET = 0.02
 """Added to colours before ratios are taken: five 8-bit steps, below which no ratio is known."""
 _MAX_EXPOSED_LUMA = 0.95
 """Luma that a deviation above the mean may reach by exposure: what is white has no shape. By eye."""
@@ -405,7 +405,7 @@ def light_maps(
     axes = torch.tensor(_CAST_AXES, dtype=torch.float64)
     # Smooth regions are sources of light, as the sky is; rough ones are things.
     deviation = torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
-    roughness = deviation / (own + _BLACK_OFFSET)
+    roughness = deviation / (own + BLACK_OFFSET)
     source = ((_MIN_THING_ROUGHNESS - roughness) / (_MIN_THING_ROUGHNESS - _MAX_SOURCE_ROUGHNESS)).clamp(0, 1)
     # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
     gain = _exposure(own, luma(painted)[:, 0], share, source, sure)
@@ -418,7 +418,7 @@ def light_maps(
     saturation = (change * softer)[:, None, None]
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
     # Contrast q: two deviations above the mean stay below white, with at least a third of the contrast.
-    below_white = (1 - gain * own) / (2 * deviation).clamp_min(_BLACK_OFFSET)
+    below_white = (1 - gain * own) / (2 * deviation).clamp_min(BLACK_OFFSET)
     contrast = gain.minimum(below_white.clamp_min(gain.clamp_max(1) / _MAX_CONTRAST_LOSS))
     bias = torch.einsum("kc,kcd->kd", (gain - contrast)[:, None] * mean, towards)
     lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
@@ -439,7 +439,7 @@ def _exposure(
     vote = share * (1 - source)
     if float(vote.sum()) < _MIN_THING_SHARE * float(share.sum()):
         vote = share  # of a scene of nothing but sky, all
-    change = (painted + _BLACK_OFFSET).log() - (own + _BLACK_OFFSET).log()
+    change = (painted + BLACK_OFFSET).log() - (own + BLACK_OFFSET).log()
     thing = torch.full_like(change, APPLIED * _quantile(change, vote * (sure + _MIN_VOTE), 0.5))
     return torch.lerp(thing, change, source).exp().clamp(_MIN_EXPOSURE_GAIN, _MAX_EXPOSURE_GAIN)
 
@@ -454,8 +454,8 @@ def _white_balance(
     """White balance g from the logarithms of colours: the cast of the references less that of the scene, axis
     by axis.
     """
-    here = (mean.clamp_min(0) + _BLACK_OFFSET).log() @ axes.T
-    there = (codes.clamp_min(0) + _BLACK_OFFSET).log() @ axes.T
+    here = (mean.clamp_min(0) + BLACK_OFFSET).log() @ axes.T
+    there = (codes.clamp_min(0) + BLACK_OFFSET).log() @ axes.T
     bright = odds * (luma(codes)[:, 0] / _CAST_LUMA).clamp(_MIN_CAST_WEIGHT, 1)
     casts = []
     for a in range(len(axes)):
@@ -501,7 +501,7 @@ def _saturation(colour: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "N"]
     """Median distance of colours from grey, relative to their luma; never 0."""
     grey = luma(colour)
     return torch.tensor(
-        _quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK_OFFSET), weight, 0.5) + _BLACK_OFFSET
+        _quantile((colour - grey).abs().amax(1) / (grey[:, 0] + BLACK_OFFSET), weight, 0.5) + BLACK_OFFSET
     )
 
 

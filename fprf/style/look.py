@@ -34,6 +34,7 @@ from ..types import Want
 from .config import Place
 from .dictionary import StyleDictionary, blend_codes, choose, concatenate
 from .light import Light, luma
+from .placed_light import Measured, PlacedLight
 from .scene_style import Membership, RegionWeight, SceneStyle, mixed_maps, own_style
 from .statistics import mix, monge, symmetric_root
 
@@ -354,10 +355,14 @@ class Painted(NamedTuple):
     belongs: Annotated[Tensor, "N K"] | None
     """Membership, once known to the stylizer: it serves regions, colours and light."""
     strength: float | Annotated[Tensor, "N 1"]
+    matched: float | Annotated[Tensor, "N 1"]
+    """Strength of what is matched: all but what is measured."""
     painted: float | Annotated[Tensor, "N 1"]
-    """Strength, as far as points are sure of their match."""
+    """`matched`, as far as points are sure of their match."""
     paint: Annotated[Tensor, "N 1"] | None
     """How sure points are; None = all are."""
+    measured: Measured | None = None
+    """Light of the very place; None where no reference shows it."""
 
 
 def _mixed_features(
@@ -392,6 +397,8 @@ class Restyle:
     """What points take, as far as they are not sure of their match, instead of all that the stylizer and
     `colours` do; None = all are sure.
     """
+    placed: PlacedLight | None = None
+    """Light of the very place, in the place of part of all this; None where no reference shows it."""
     share: float = 1.0
     """Its part of the mix; those of all parts sum to 1."""
     places: tuple[tuple[Place, "Restyle"], ...] = ()
@@ -440,7 +447,9 @@ class Restyle:
                 needs |= part.stylizer.needs
                 if part.colours is not None:
                     needs |= part.colours.needs
-                if part.light is not None or (part.regions is not None and part.regions.membership.divided):
+                if part.light is not None or part.placed is not None:
+                    needs |= Want.SEMANTIC
+                if part.regions is not None and part.regions.membership.divided:
                     needs |= Want.SEMANTIC
         return needs
 
@@ -482,7 +491,7 @@ class Restyle:
             if part.strength > 0:
                 active.append((part, each))
         own = colour
-        if luminance > 0 or any(each.paint is not None for _, each in active):
+        if luminance > 0 or any(each.paint is not None or each.measured is not None for _, each in active):
             own = decoder(content) if plain is None else plain
         # Colours: the maps move what was decoded, light moves the scene's own colours.
         changes = []
@@ -492,7 +501,9 @@ class Restyle:
                 changes.append(part.share * each.painted * change)
             if part.light is not None:
                 lit = part.light(own, semantic, each.paint, each.belongs)
-                changes.append(part.share * each.strength * lit)
+                changes.append(part.share * each.matched * lit)
+            if each.measured is not None:
+                changes.append(part.share * each.strength * each.measured.change(own))
         if changes:
             colour = (colour + torch.stack(changes).sum(0)).clamp(0, 1)
         if luminance > 0:
@@ -506,7 +517,7 @@ class Restyle:
         their match.
         """
         if self.strength == 0:
-            return Painted(content, None, 0.0, 0.0, None)
+            return Painted(content, None, 0.0, 0.0, 0.0, None)
         moved, belongs = self.stylizer.shared(content, semantic)
         strength: float | Tensor = self.strength
         if self.regions is not None:
@@ -517,17 +528,24 @@ class Restyle:
                 there = semantic
             weight: Tensor = self.regions(there, belongs)
             strength = strength * weight
-        painted = strength
+        matched = strength
+        measured = None
+        if self.placed is not None:
+            assert semantic is not None, "Want.SEMANTIC was asked for"
+            measured = self.placed(semantic, belongs)
+            matched = strength * (1 - measured.share.to(content))
+        painted = matched
         paint = None
         if self.light is not None:
             assert semantic is not None, "Want.SEMANTIC was asked for"
             paint = self.light.paint(semantic, belongs)
-            painted = strength * paint.to(content)
+            painted = matched * paint.to(content)
         # At 0 the scene's own features, at 1 the styled ones, both bit for bit.
         share = self.features * painted
         if isinstance(share, Tensor):
             share = share.to(content)
-        return Painted(torch.lerp(content, moved, share), belongs, strength, painted, paint)
+        moved = torch.lerp(content, moved, share)
+        return Painted(moved, belongs, strength, matched, painted, paint, measured)
 
     def match(
         self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None

@@ -20,6 +20,7 @@ from .files import Keyframe, StyleFile, check_photographs, fade, read_style, wit
 from .light import light_of
 from .look import Restyle, colour_maps, decoded_colours, region_maps, regional
 from .matching import unit
+from .placed_light import placed_light
 from .regions import RegionControls, Regions, region_controls
 from .scene_style import RegionWeight, SceneStyle, own_style
 
@@ -152,6 +153,7 @@ def apply_dictionary(
                 share=config.colours,
                 smoothing=config.smoothing(scene_style, allowed),
             )
+        placed = placed_light(scene_style, dictionary, allowed) if config.light else None
         light = None
         if config.light and style.bold < 1:
             colours_before = decoded_colours(stylizer, scene_style, scene.decoder, features=0.0)
@@ -167,6 +169,7 @@ def apply_dictionary(
             luminance=style.luminance,
             sun=sun_of(style),
             light=None if light is None else light.to(device),
+            placed=None if placed is None else placed.to(device),
         )
 
     places = tuple((place.about(scene.origin), look(allowed)) for place, allowed in controls.places)

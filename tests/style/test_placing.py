@@ -1,0 +1,285 @@
+"""A photograph of the very place: it is found by local features, others are not, and light is measured there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from fprf.errors import CheckpointError
+from fprf.io.images import to_uint8, write_image
+from fprf.ops.harmonics import HARMONIC, as_drawn
+from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.plugins.stylizers.config import AdainConfig, RegionToneConfig
+from fprf.scenes import Scene
+from fprf.splats.captures import look_at_capture
+from fprf.splats.config import GaussianSemanticsConfig, LookConfig
+from fprf.splats.gaussians import Gaussians
+from fprf.splats.restyle import all_around, restyled_harmonics
+from fprf.splats.semantics import load_semantics, semantics_tensors
+from fprf.style.config import StyleConfig
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, concatenate
+from fprf.style.files import StyleFile
+from fprf.style.light import BLACK_OFFSET
+from fprf.style.look import Restyle
+from fprf.style.placed_light import PlacedLight, fit_gains, placed_light
+from fprf.style.placing import (
+    Keypoints,
+    Landmarks,
+    Pairs,
+    ViewSamples,
+    find_keypoints,
+    find_place,
+    keypoint_tensors,
+    keypoints_from,
+    view_keypoints,
+)
+from fprf.style.restyle import apply_style
+from fprf.style.scene_style import SceneStyle, scene_style
+
+SIZE = (120, 160)
+EVERYWHERE = torch.ones(2, 1, dtype=torch.bool)
+
+
+def picture(seed: int) -> Tensor:
+    """Coloured patches of many sizes: what local features live on."""
+    draw = np.random.default_rng(seed)
+    image = np.full((*SIZE, 3), 0.5, np.float32)
+    for _ in range(250):
+        height, width = draw.integers(4, 25, 2)
+        y = draw.integers(0, SIZE[0] - 4)
+        x = draw.integers(0, SIZE[1] - 4)
+        image[y : y + height, x : x + width] = draw.uniform(0.1, 0.9, 3)
+    return torch.from_numpy(image)
+
+
+def landmarks(image: Tensor) -> Landmarks:
+    """A picture as the only view; semantics are the places of its pixels."""
+    y, x = torch.meshgrid(torch.arange(SIZE[0]) + 0.5, torch.arange(SIZE[1]) + 0.5, indexing="ij")
+    pixel = torch.stack([x.flatten(), y.flatten()], 1)
+    samples = ViewSamples(pixel, image.flatten(0, 1), pixel)
+    return Landmarks((view_keypoints(image),), lambda view: samples)
+
+
+def relit(image: Tensor) -> Tensor:
+    return image**1.5 * torch.tensor([0.9, 0.6, 0.4])
+
+
+def test_a_part_of_the_place_in_another_light_is_found_to_the_pixel() -> None:
+    image = picture(0)
+    left, top = 40, 20
+    pairs = find_place(landmarks(image), relit(image[top:110, left:150]))
+    assert pairs is not None and pairs.agreeing >= 20
+    inside = (pairs.semantic[:, 0] - left).abs().max() <= 111 and len(pairs.own) > 0.9 * 110 * 90
+    assert bool(inside)
+    # What it shows there is the same spot in its light; both sides are compared, one of them as a mean of a box.
+    apart = (pairs.shown - relit(pairs.own)).abs().mean()
+    anywhere = (pairs.shown.flip(0) - relit(pairs.own)).abs().mean()
+    assert float(apart) < 0.3 * float(anywhere)
+
+
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_another_place_is_not_found(seed: int) -> None:
+    assert find_place(landmarks(picture(0)), picture(seed)) is None
+    assert find_place(landmarks(picture(0)), torch.full((*SIZE, 3), 0.5)) is None, "nor is nothing"
+
+
+def test_what_a_mask_leaves_out_is_not_compared() -> None:
+    image = picture(0)
+    where = torch.zeros(SIZE, dtype=torch.bool)
+    where[:, 80:] = True
+    pairs = find_place(landmarks(image), image, where)
+    assert pairs is not None and float(pairs.semantic[:, 0].min()) > 78
+    assert find_place(landmarks(image), image, torch.zeros_like(where)) is None
+
+
+def test_keypoints_go_through_a_file_and_damage_is_told() -> None:
+    views = (view_keypoints(picture(0)), view_keypoints(torch.zeros(*SIZE, 3)), find_keypoints(picture(1), 7))
+    assert len(views[1].position) == 0 < len(views[2].position) <= 7
+    tensors = keypoint_tensors(views)
+    for before, after in zip(views, keypoints_from(tensors), strict=True):
+        assert torch.equal(before.position, after.position) and torch.equal(
+            before.descriptor, after.descriptor
+        )
+    assert keypoints_from({}) == ()
+    with pytest.raises(CheckpointError, match="keypoints"):
+        keypoints_from({**tensors, "descriptor": tensors["descriptor"][:-1]})
+    with pytest.raises(CheckpointError, match="keypoints"):
+        keypoints_from({"count": tensors["count"]})
+
+
+def test_known_gains_are_recovered() -> None:
+    """Of colours that were lit by gains that follow from what is known of points."""
+    draw = torch.Generator().manual_seed(0)
+    what = torch.rand(4000, 5, generator=draw, dtype=torch.float64) - 0.5
+    true = torch.rand(5, 3, generator=draw, dtype=torch.float64) - 0.5
+    own = torch.rand(4000, 3, generator=draw, dtype=torch.float64)
+    shown = (own + BLACK_OFFSET) * (what @ true).exp() - BLACK_OFFSET
+    # The ridge of 0.003 beside a variance of 1/12 takes 3.6 % of the coefficients.
+    assert float((fit_gains(own, shown, what) - true).abs().max()) < 0.06 * float(true.abs().max())
+
+
+def scene_of(count: int = 400) -> tuple[Tensor, Tensor, SceneStyle]:
+    """Colours and semantics of points of two kinds."""
+    draw = torch.Generator().manual_seed(1)
+    kind = torch.arange(count) % 2
+    colour = 0.2 + 0.4 * torch.rand(count, 3, generator=draw)
+    semantic = torch.eye(4)[kind] + 0.02 * torch.randn(count, 4, generator=draw)
+    return colour, semantic, scene_style(colour, semantic, torch.ones(count), None, 2, 0)
+
+
+GAIN = torch.tensor([[0.5, 0.6, 0.9], [1.3, 1.1, 0.7]])
+"""Of both kinds."""
+
+
+def lit_reference(*kinds: int, name: str = "r") -> Reference:
+    """A reference that shows points of these kinds in a new light, and looks like something else otherwise."""
+    colour, semantic, _ = scene_of()
+    kind = torch.arange(len(colour)) % 2
+    some = torch.isin(kind, torch.tensor(kinds))
+    shown = (colour + BLACK_OFFSET) * GAIN[kind] - BLACK_OFFSET
+    pairs = Pairs(colour[some], shown[some], semantic[some], 20)
+    other = 1 - colour
+    return Reference(name, other, semantic, colour=other, placed=pairs)
+
+
+def dictionary_of(*references: Reference) -> StyleDictionary:
+    return build_dictionary(references, clusters=2, blend=0.0)
+
+
+def placed_of(scene: SceneStyle, *references: Reference) -> PlacedLight:
+    every = torch.ones(2, len(references), dtype=torch.bool)
+    placed = placed_light(scene, dictionary_of(*references), every)
+    assert placed is not None
+    return placed
+
+
+def test_points_take_the_gain_of_their_kind_and_what_was_not_seen_is_left() -> None:
+    _, semantic, scene = scene_of()
+    kind = torch.arange(len(semantic)) % 2
+    measured = placed_of(scene, lit_reference(0, 1))(semantic)
+    assert 0.8 < float(measured.share.min()) <= float(measured.share.max()) < 1
+    gain = 1 + measured.excess / measured.share
+    assert float((gain - GAIN[kind]).abs().max()) < 0.05
+    half = placed_of(scene, lit_reference(1))(semantic).share[:, 0]
+    assert float(half[kind == 0].max()) < 0.1 and float(half[kind == 1].min()) > 0.8
+
+
+def test_several_references_share_by_weight_and_what_is_forbidden_is_not_taken() -> None:
+    _, semantic, scene = scene_of()
+    here = lit_reference(0, 1)
+    elsewhere = here._replace(name="elsewhere", placed=None, content=here.content**2)
+    alone = placed_of(scene, here)(semantic).share
+    weighed = placed_of(scene, here._replace(weight=3.0), elsewhere)(semantic).share
+    assert torch.allclose(weighed, 0.75 * alone, atol=1e-4)
+    d = dictionary_of(here, elsewhere)
+    shown = list(d.names).index("r")
+    allowed = torch.ones(2, 2, dtype=torch.bool)
+    allowed[0, shown] = False
+    placed = placed_light(scene, d, allowed)
+    assert placed is not None and float(placed.trust[0]) == 0 < float(placed.trust[1])
+    only = torch.zeros(2, dtype=torch.bool)
+    only[1 - shown] = True
+    assert placed_light(scene, choose(d, only)[0], EVERYWHERE) is None
+    # Without pairs nobody looked, and joining keeps what is known.
+    assert placed_light(scene, d._replace(placed=()), allowed) is None
+    parts = [choose(d, torch.arange(2) == i)[0] for i in range(2)]
+    joined = concatenate(parts, d.names, [1.0, 1.0])
+    assert [each is None for each in joined.placed] == [each is None for each in d.placed]
+
+
+def test_fields_and_gaussians_take_the_same_and_strength_scales_it() -> None:
+    colour, semantic, scene = scene_of()
+    d = dictionary_of(lit_reference(0, 1))
+    # An affine stylizer without colours behind it acts on both alike.
+    stylizer = AdainConfig().build(dictionary=d, scene=scene)
+    look = Restyle(stylizer, placed=placed_light(scene, d, EVERYWHERE))
+
+    def drawn(look: Restyle) -> Tensor:
+        harmonics = ((colour - 0.5) / HARMONIC)[:, None]
+        restyled = restyled_harmonics(harmonics, torch.zeros_like(colour), semantic, look)
+        return as_drawn(restyled, all_around(1))[:, 0] * HARMONIC + 0.5
+
+    def shown(look: Restyle) -> Tensor:
+        return look.colour(lambda content: content, colour, semantic)  # type: ignore[arg-type]
+
+    both = drawn(look)
+    inside = ((both > 0.01) & (both < 0.99)).all(1)
+    assert int(inside.sum()) > 0.8 * len(both)
+    assert torch.allclose(both[inside], shown(look)[inside], atol=1e-4)
+    middle = shown(replace(look, strength=0.5))
+    assert torch.allclose(middle[inside], 0.5 * (colour + shown(look))[inside], atol=1e-4)
+    assert torch.equal(shown(replace(look, strength=0.0)), colour)
+
+
+def wall() -> Gaussians:
+    """A wall of coloured patches, turned to the cameras."""
+    image = picture(3)[::2, ::2]
+    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
+    means = torch.stack([(x - 40) / 40, (30 - y) / 40, torch.zeros_like(x)], 2).flatten(0, 1)
+    count = len(means)
+    return Gaussians(
+        means=means,
+        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4).contiguous(),
+        log_scales=torch.full((count, 3), 0.013).log(),
+        logits=torch.full((count,), 6.0),
+        harmonics=((image.flatten(0, 1) - 0.5) / HARMONIC)[:, None],
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    config = LookConfig(
+        semantic=GaussianSemanticsConfig(encoder=BundledSemanticConfig()),
+        regions=4,
+        views=6,
+        size=(160, 120),
+        up=(0.0, 1.0, 0.0),
+    )
+    return look_at_capture(wall(), False, config.semantic.encoder.build(), config)
+
+
+def best_view(scene: Scene) -> int:
+    """The view that shows most of it."""
+    shown = [float(scene.render(scene.cameras, v).opacity.sum()) for v in range(len(scene.cameras))]
+    return int(np.argmax(shown))
+
+
+def test_a_capture_takes_the_light_of_a_photograph_of_itself(scene: Scene, tmp_path: Path) -> None:
+    view = best_view(scene)
+    plain = scene.render(scene.cameras, view).rgb
+    solid = scene.render(scene.cameras, view).opacity > 0.9
+    truth = (plain * torch.tensor([0.3, 0.5, 0.9])).clamp(0, 1)
+    write_image(tmp_path / "dusk.png", to_uint8(truth[:, : truth.shape[1] * 2 // 3]))
+    write_image(tmp_path / "other.png", to_uint8(picture(8)))
+
+    def off(name: str, landmarks: bool) -> float:
+        encoders = scene.encoders()
+        if not landmarks:
+            encoders = encoders._replace(landmarks=None)
+        style = StyleConfig(references=(tmp_path / name,), stylizer=RegionToneConfig())
+        styled = apply_style(scene, StyleFile(style), encoders)
+        assert (styled.restyle.placed is not None) == (landmarks and name == "dusk.png")
+        shown = scene.restyled(styled.restyle).render(scene.cameras, view).rgb
+        return float((shown - truth)[solid].square().mean())
+
+    assert off("dusk.png", True) < 0.5 * off("dusk.png", False)
+    assert off("other.png", True) == off("other.png", False), "another place changes nothing"
+
+
+def test_what_earlier_versions_found_is_read_and_places_nothing(scene: Scene) -> None:
+    found = scene.found()  # type: ignore[attr-defined]
+    tensors = semantics_tensors(found)
+    again = load_semantics(tensors, len(found.features))
+    assert again.seen is not None and len(again.seen.keypoints) == 6
+    assert torch.equal(again.seen.cameras.pose, found.seen.cameras.pose)
+    old = {name: t for name, t in tensors.items() if not name.startswith(("seen.", "keypoints."))}
+    assert load_semantics(old, len(found.features)).seen is None
+
+
+def test_no_keypoints_match_nothing() -> None:
+    none = Keypoints(torch.zeros(0, 2), torch.zeros(0, 128, dtype=torch.uint8))
+    blank = Landmarks((none,), lambda view: ViewSamples(*(torch.zeros(0, 2),) * 3))
+    assert find_place(blank, picture(0)) is None
