@@ -3,12 +3,14 @@
 Each problem names its remedy.
 """
 
+import getpass
 import os
 import platform
+import re
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -21,6 +23,7 @@ from rich.markup import escape
 
 from .. import __version__
 from ..errors import ConfigError, DataError
+from ..io.paths import as_path
 from ..plugins import registry
 from ..plugins.captures import format_name, is_scene
 from ..plugins.slots import slots
@@ -29,6 +32,12 @@ from .parsing import parse
 if TYPE_CHECKING:
     from ..datamanagers.photograph_files import Photographs
 
+_PATH_PATTERN = re.compile(
+    r"PATH[^\s;,'\"]*|(?<![\w:/.~])~?/[^\s;,'\"]+|\b[A-Za-z]:\\[^;,'\"]+|\\\\[^\s;,'\"]+"
+)
+"""Absolute paths in messages, of POSIX and Windows."""
+_MIN_NAME_LENGTH = 3
+"""Shorter names of users and machines are parts of other words, and tell nobody's."""
 _BYTES_PER_MIB = 1 << 20
 """For sizes in messages."""
 _MAX_VIDEO_SECONDS = 30.0
@@ -60,8 +69,12 @@ class DoctorConfig:
     """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
     """Delete the cached feature targets of all scenes; they are made again when needed."""
+    report: bool = False
+    """Print what is found of this machine as text for a report of a fault, without paths and names."""
 
     def __post_init__(self) -> None:
+        if self.report and (self.target is not None or self.clean):
+            raise ConfigError(f"report: is of this machine; leave out --report or {self.target or '--clean'}")
         if self.target is not None and self.device != "auto":
             raise ConfigError(
                 f"device: {self.device} is tested only where no target is given; leave out --device or {self.target}"
@@ -75,7 +88,7 @@ def run(args: list[str]) -> int:
     about = (
         "`fprf doctor` looks over this machine and tests its device, `fprf doctor DIR` a scene folder,\n"
         "`fprf doctor FILE` a capture of 3D Gaussians,\n"
-        "`fprf doctor METHOD` what a method needs here."
+        "`fprf doctor METHOD` what a method needs here. `fprf doctor --report` is for reports of faults."
     )
     config = parse(DoctorConfig(), args, prog="fprf doctor", description=about, positional=("target",))
     target = config.target
@@ -99,6 +112,9 @@ def run(args: list[str]) -> int:
         findings = video_file(target)
     else:
         findings = scene_folder(target)
+    if config.report:
+        print(report_of(findings))
+        return 0
     console = Console(highlight=False)
     bad = False
     for finding in findings:
@@ -113,6 +129,32 @@ def run(args: list[str]) -> int:
         if finding.remedy:
             console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
     return int(bad)
+
+
+def report_of(findings: Iterable[Finding]) -> str:
+    """Findings as Markdown for a report of a fault; what is a path, or could name somebody, is left out."""
+    lines = []
+    for finding in findings:
+        if not finding.remedy:
+            mark = "ok"
+        else:
+            mark = "optional" if finding.optional else "problem"
+        lines.append(f"{mark:<8}  {finding.what:<14} {without_paths(finding.found)}".rstrip())
+    return "\n".join(["```text", *lines, "```"])
+
+
+def without_paths(text: str) -> str:
+    """The text with PATH for each absolute path, and NAME for the names of user and machine."""
+    from ..io.cache import user_folder
+
+    # Those that are known as a whole: a space may be in them.
+    for folder in (user_folder("features"), Path.cwd(), as_path("~")):
+        text = text.replace(str(folder), "PATH")
+    text = _PATH_PATTERN.sub("PATH", text)
+    for name in (getpass.getuser(), platform.node()):
+        if len(name) >= _MIN_NAME_LENGTH:
+            text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "NAME", text)
+    return text
 
 
 def _is_video(path: Path) -> bool:
@@ -165,6 +207,12 @@ def machine() -> Iterator[Finding]:
             )
         else:
             yield Finding("accelerator", "none: `--device auto` takes the processor")
+            if torch.version.cuda is not None and not torch.version.hip:
+                found = f"torch is built for CUDA {torch.version.cuda}, and no NVIDIA GPU is here: gigabytes for nothing"
+                remedy = (
+                    "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cpu"
+                )
+                yield Finding("torch", found, remedy, optional=True)
     except Exception as error:  # a broken installation is a finding, not a crash
         yield Finding("torch", f"{type(error).__name__}: {error}", "pip install --force-reinstall torch")
     from ..datamanagers.features import CACHED_BYTES

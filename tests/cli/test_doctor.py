@@ -21,8 +21,17 @@ from raw_files import dng
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.doctor import Finding, machine, method_needs, run, scene_folder, self_test, video_file
-from fprf.errors import DataError
+from fprf.cli.doctor import (
+    Finding,
+    machine,
+    method_needs,
+    run,
+    scene_folder,
+    self_test,
+    video_file,
+    without_paths,
+)
+from fprf.errors import ConfigError, DataError
 from fprf.ops import dense
 from fprf.style.look import Restyle
 from fprf.training import device_check, views
@@ -308,3 +317,45 @@ def test_photographs_that_say_no_focal_length_are_told(tmp_path: Path) -> None:
             Image.fromarray(pixels).save(tmp_path / f"{name}_{k}.jpg")
     found = _by_name(scene_folder(tmp_path))["lenses"].found
     assert found.startswith("8 of 8 photographs") and "names" in found
+
+
+def test_cuda_without_a_card_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", "12.6")
+    monkeypatch.setattr(torch.version, "hip", None)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    (told,) = (each for each in machine() if "no NVIDIA GPU is here" in each.found)
+    assert told.optional and told.remedy.endswith("/whl/cpu")
+
+
+def test_a_report_names_no_place_and_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a cache of mine"))
+    monkeypatch.setattr("getpass.getuser", lambda: "margaret")
+    monkeypatch.setattr("platform.node", lambda: "attic-pc")
+    monkeypatch.setattr(
+        "fprf.cli.doctor.self_test", lambda device: iter([Finding("self-test", "margaret on attic-pc")])
+    )
+    assert run(["--report"]) == 0
+    text = capsys.readouterr().out
+    assert "torch" in text and "NAME on NAME" in text
+    for private in ("margaret", "attic", str(tmp_path), tmp_path.name, "of mine"):
+        assert private not in text
+    assert run(["--report", "--device", "cpu"]) == 0
+    with pytest.raises(ConfigError, match="report"):
+        run(["--report", "fprf-lite"])
+
+
+@pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        ("3 MiB in /home/ann/.cache/fprf/features; --clean", "3 MiB in PATH; --clean"),
+        (r"C:\\Users\\Ann\\x.ply: cut off", "PATH"),
+        ("PSNR 1/2, https://pypi.org and 30 MiB/s stay", "PSNR 1/2, https://pypi.org and 30 MiB/s stay"),
+        ("~/x is one", "PATH is one"),
+    ],
+)
+def test_paths_are_left_out(text: str, left: str) -> None:
+    assert without_paths(text).startswith(left)
