@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal
 
 from .errors import Stopped
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from .reconstruction.config import SfmConfig
     from .run_config import RunConfig
 
-__version__ = "0.1.0"
+__version__ = version("fprf")
 __all__ = ["Stopped", "__version__", "load", "process", "read", "train"]
 
 

@@ -22,6 +22,12 @@ ROOT = Path(__file__).resolve().parents[2]
 LOG = logging.getLogger("mkdocs.hooks.fprf")
 FRONT = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
 """Pages that lie outside of docs/, and where the site has them."""
+FRAME = (
+    '<iframe src="garden.html" title="A garden to walk through, in four lights" loading="lazy" '
+    'sandbox="allow-scripts" style="width: 100%; height: 32rem; border: 0"></iframe>'
+)
+LIVE = re.compile(r"^!\[[^\]]*\]\([^)]*garden\.webp\)$", re.MULTILINE)
+"""The README's film, in the place of which the first page has the garden itself."""
 LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
 
 
@@ -42,9 +48,10 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds what does not lie in docs/: pages, schemas of files."""
     for source, page in FRONT.items():
-        files.append(
-            File.generated(config, page, content=moved((ROOT / source).read_text("utf-8"), source, page))
-        )
+        content = moved((ROOT / source).read_text("utf-8"), source, page)
+        if page == "index.md":
+            content = LIVE.sub(FRAME, content)
+        files.append(File.generated(config, page, content=content))
     for verb, about in VERBS.items():
         files.append(File.generated(config, f"verbs/{verb}.md", content=verb_page(verb, about)))
     for name in ("style", "keyframes", "config"):
