@@ -99,7 +99,7 @@ def run(args: list[str]) -> int:
     with contextlib.ExitStack() as stack:
         # The address is taken first: while torch is imported the browser already has a page.
         server = stack.enter_context(ViewerServer(access, config.port))
-        from ..page.uploads import is_capture
+        from ..page.uploads import is_capture, newest_step
 
         # `--follow` waits for a run folder that training has not made yet.
         path = config.run
@@ -131,7 +131,13 @@ def run(args: list[str]) -> int:
             else:
                 opening = functools.partial(load, path)
                 session = None
-                if not config.follow:
+                # A run that training has only begun is waited for: its first checkpoint is about to come.
+                begun = not is_capture(path) and newest_step(path) < 0
+                if begun:
+                    server.wait(
+                        "opening", f"{path}: no checkpoint yet; it is shown as soon as training saves one"
+                    )
+                if not (config.follow or begun):
                     session = server.open(opening)
                 if not is_capture(path):
                     from ..page.session import TrainingFollower

@@ -142,6 +142,25 @@ def make_access(host: str, token: str | None) -> Access:
     return Access(host, token)
 
 
+def network_address(host: str) -> str:
+    """The address by which other machines reach this one, where it listens on all of its own (`host`); without
+    a network that of this machine alone. Nothing is sent to find it.
+    """
+    family = socket.AF_INET
+    elsewhere = "192.0.2.1"  # for documentation (RFC 5737)
+    here = "127.0.0.1"
+    if ":" in host:
+        family = socket.AF_INET6
+        elsewhere = "2001:db8::1"
+        here = "::1"
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((elsewhere, 9))
+            return str(probe.getsockname()[0])
+        except OSError:
+            return here
+
+
 def is_loopback(host: str) -> bool:
     """True for a name or address of this machine alone."""
     if host.lower() == "localhost":
@@ -331,7 +350,7 @@ class ViewerServer:
     def address(self) -> str:
         """The URL to open in a browser, with the token."""
         if self.access.host in _ANY_ADDRESS:
-            host = "127.0.0.1"
+            host = network_address(self.access.host)
         else:
             host = self.access.host
         host = f"[{host}]" if ":" in host else host

@@ -398,7 +398,7 @@ class Start:
             self._set(
                 what=what,
                 share=event["share"],
-                detail=f"step {event['step']} · {event['psnr']:.1f} dB · {clock}",
+                detail=clock,
             )
         elif "total" in event:
             share = event["done"] / max(1, event["total"])

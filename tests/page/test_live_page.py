@@ -355,6 +355,57 @@ def test_leaving_during_an_upload_asks_and_another_page_is_told_before_it_sends(
         assert asked == ["beforeunload"] and [*tmp_path.glob("made/*")] == []
 
 
+def test_a_run_without_a_checkpoint_is_waited_for(run: Path) -> None:
+    newest = max((run / "checkpoints").glob("step-*"))
+    shutil.move(newest, run / "hidden")
+    with served(run) as address, front(address, "#loading") as page:
+        page.locator("#said .wait", has_text="no checkpoint yet; it is shown as soon as").wait_for()
+        shutil.move(run / "hidden", newest)
+        page.wait_for_selector(".place.drawn", timeout=120_000)
+        page.locator("#said .wait").wait_for(state="detached")
+
+
+def test_long_names_full_screen_and_a_comparison_with_oneself(world: World) -> None:
+    name = "IMG_20240612_a_very_long_name_without_any_space_" * 2
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        session = server.open(lambda: Viewed(seen(ball(400, 2)), name, 1), warm=False)
+        session.upload(world.references[0].read_bytes(), f"{name}.png")
+        with front(server.address) as page:
+            page.wait_for_function("() => fprf.place.splats.styles.has('Now')", timeout=60_000)
+            page.evaluate("() => fprf.stage.set({ from: 'Captured', to: 'Captured' })")
+            page.locator("#wiping").click()
+            assert page.evaluate("() => [fprf.stage.from, fprf.stage.to]") == ["Captured", "Now"]
+            page.locator("#wiping").click()
+            page.mouse.click(300, 300)
+            state(page, "state.picked?.taken.length > 0")
+            share = page.locator("#region data").first
+            assert "%" in share.inner_text() and share.bounding_box()["height"] < 30, "on one line"
+            page.set_viewport_size({"width": 400, "height": 800})
+            assert page.evaluate("() => document.documentElement.scrollWidth") == 400
+            page.set_viewport_size({"width": 1000, "height": 700})
+            page.locator("#full").click()
+            page.wait_for_function("() => document.fullscreenElement")
+            page.evaluate("() => say('something', true)")
+            assert page.locator("#said .bad").is_visible()
+            inside = "() => document.fullscreenElement.contains(at('said'))"
+            page.wait_for_function(inside)
+
+
+def test_photographs_beyond_what_the_shelf_holds_are_named(world: World, tmp_path: Path) -> None:
+    many = []
+    for number in range(14):
+        many.append(tmp_path / f"photograph-{number}.png")
+        shutil.copyfile(world.references[number % 2], many[-1])
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        server.open(lambda: Viewed(seen(ball(300, 1)), "ball", 1), warm=False)
+        with front(server.address) as page:
+            page.set_input_files("#photographs", [str(path) for path in many])
+            told = page.locator("#said .bad", has_text="14 photographs: the first 12 were taken").inner_text()
+            assert told.endswith("Left out: photograph-12.png, photograph-13.png")
+            found = state(page, "state.shelf.length === 12", 240_000)
+            assert all(row["weight"] == 1 for row in found["shelf"])
+
+
 def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:
     shipped = Path(str(files("fprf") / "garden"))
     given = tmp_path / "garden"

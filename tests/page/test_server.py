@@ -7,6 +7,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import pytest
 from starlette.requests import Request
@@ -17,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
 from fprf.page import EXAMPLES, server
-from fprf.page.server import Access, Client, ViewerServer, cookie_name, make_access
+from fprf.page.server import Access, Client, ViewerServer, cookie_name, make_access, network_address
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
@@ -300,6 +301,24 @@ def test_a_client_that_is_slow_gets_the_newest_of_each_kind_alone() -> None:
         client.put("state", str(number))
         client.put(f"said {number % 2}", str(number))
     assert client._waiting == {"said 0": "998", "state": "999", "said 1": "999"}
+
+
+def test_an_address_for_the_network_is_printed_where_it_is_listened_to() -> None:
+    with ViewerServer(THERE, 0) as found:
+        host = urlsplit(found.address).hostname
+        assert host == network_address("0.0.0.0") and found.address.endswith(f"?token={TOKEN}")
+        socket.create_connection((host, found.port), timeout=30).close()  # it leads here
+
+
+def test_without_a_network_it_is_that_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreachable(self: socket.socket, address: object) -> None:
+        raise OSError(101, "Network is unreachable")
+
+    monkeypatch.setattr(socket.socket, "connect", unreachable)
+    assert network_address("0.0.0.0") == "127.0.0.1"
+    monkeypatch.undo()
+    monkeypatch.setattr(socket.socket, "getsockname", lambda self: ("10.1.2.3", 4))
+    assert network_address("0.0.0.0") == "10.1.2.3", "not the loopback, which other machines cannot reach"
 
 
 def page_of(address: str) -> bytes:

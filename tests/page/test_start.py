@@ -133,7 +133,7 @@ def test_a_scene_in_training_is_shown_until_it_is_left(
 ) -> None:
     page.handle(Open(path=str(photographs)))
     state = page.reached(stage="training", share=0.5)
-    assert state["detail"] == "step 7 · 20.0 dB · 1:01 left"
+    assert state["detail"] == "1:01 left"
     until(lambda: len(page.shown) == 1)
     # An interrupt at the terminal does not reach it past the viewer, whose own would be the second.
     assert page._process is not None and os.getpgid(page._process.pid) == page._process.pid

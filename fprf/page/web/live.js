@@ -179,6 +179,8 @@ class Live {
     this.photographs = new Photographs(this);
     at("finish").onclick = () => this.start.stop();
     at("scenes").onclick = () => this.leave();
+    // What fills the screen shows messages too.
+    addEventListener("fullscreenchange", () => (document.fullscreenElement ?? document.body).append(at("said"), at("veil")));
     this.mode("loading");
     this.connect();
   }
@@ -359,7 +361,7 @@ class Live {
     const { canvas } = place;
     const by = PREVIEW_PIXELS / Math.max(canvas.width, canvas.height);
     const small = make("canvas", { width: Math.max(1, Math.round(by * canvas.width)), height: Math.max(1, Math.round(by * canvas.height)) });
-    place.splats.draw(place.camera.view, place.lens, place.look, { near: place.scene.near, background: place.scene.background, exact: true });
+    place.paint();
     small.getContext("2d").drawImage(canvas, 0, 0, small.width, small.height);
     small.toBlob((blob) => {
       // It stands in, too, where the graphics card drops the picture.
@@ -377,7 +379,8 @@ class Live {
     const [bar, text] = at("training").children;
     at("training").hidden = false;
     bar.value = share;
-    text.textContent = share < 1 ? `training, step ${step} · ${psnr.toFixed(1)} dB · ${clock}` : `trained, ${step} steps`;
+    text.textContent = share < 1 ? `training, ${clock}` : "trained";
+    text.title = `step ${step}, ${psnr.toFixed(1)} dB on the photographs`;
   }
 
   /** Fetch colours that the server has made, under a name of the stage. */

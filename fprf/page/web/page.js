@@ -56,7 +56,7 @@ class Stage {
     Object.assign(this, { place, root: at("place"), styles: [], from: null, to: null, amount: 1, wiping: false, line: 0.5, listeners: {} });
     at("mix").oninput = () => this.set({ amount: at("mix").value / 100 });
     at("from").onchange = () => this.set({ from: at("from").value });
-    at("wiping").onclick = () => this.set({ wiping: !this.wiping, ...(this.wiping ? {} : { line: 0.5 }) });
+    at("wiping").onclick = () => this.compare();
     at("back").onclick = () => this.place.step(-1);
     at("next").onclick = () => this.place.step(1);
     at("reset").onclick = () => this.place.home();
@@ -89,6 +89,13 @@ class Stage {
     at("looks").insertBefore(card, at("add"));
     at("from").append(make("option", { value: style.name, textContent: style.name }));
     this.set(this.from === null ? { from: style.name, to: style.name } : {});
+  }
+
+  // A line between two styles, or none: never between one and itself.
+  compare() {
+    const [first, second] = this.styles;
+    if (!this.wiping && this.from === this.to && second) this.set(this.to === first.name ? { to: second.name } : { from: first.name });
+    this.set({ wiping: !this.wiping, ...(this.wiping ? {} : { line: 0.5 }) });
   }
 
   remove(name) {
@@ -163,7 +170,7 @@ class Stage {
     const style = digit && this.styles[Number(digit[1])];
     if (style) this.choose(style.name);
     else if (event.key === "[" || event.key === "]") this.set({ amount: Math.min(1, Math.max(0, this.amount + (event.key === "]" ? 0.1 : -0.1))) });
-    else if (event.code === "KeyC") this.set({ wiping: !this.wiping });
+    else if (event.code === "KeyC") this.compare();
     else if (event.code === "KeyV") this.place.step(event.shiftKey ? -1 : 1);
     else if (event.code === "KeyR") this.place.home();
     else if (event.key === "?" || event.code === "KeyH") at("help").hidden = !at("help").hidden;

@@ -242,12 +242,13 @@ class Panel {
     const taken = new Map(picked.taken.map((row) => [row.name, row.share]));
     const rows = shelf.map(({ name, card }) => {
       const share = taken.has(name) ? `${Math.round(100 * taken.get(name))} %` : "";
-      const only = pill("only", "pin", card, ruled("pin", card));
+      const only = pill("only this", "pin", card, ruled("pin", card));
       const never = pill("never", "forbid", card, ruled("forbid", card));
-      return make("div", { className: "row" }, make("span", { textContent: `${name} ${share}` }), only, never);
+      const much = make("data", { value: taken.get(name) ?? 0, textContent: share });
+      return make("div", { className: "row" }, make("span", { textContent: name, title: name }), much, only, never);
     });
     const keep = pill("keep as it is", "keep", null, ruled("keep", null));
-    const free = pill("free", "free", null, false);
+    const free = pill("as the style decides", "free", null, false);
     at("region").replaceChildren(head, ...rows, make("div", { className: "row" }, keep, free));
   }
 
