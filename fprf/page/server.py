@@ -662,7 +662,7 @@ def _example(name: str) -> str:
     """A photograph that ships with fprf, as a link that saves it where no script takes it."""
     link = f'class="example" data-example="{name}" href="/examples/{name}" download title="by Greg Zaal, CC0"'
     word = name.partition(".")[0]
-    return f'<a {link}><img src="/examples/{name}" alt="{word}">{word}</a>'
+    return f'<a {link}><img src="/examples/{name}" alt="">{word}</a>'
 
 
 def _asset(kind: str, text: Callable[[], str]) -> Callable[[Request], Response]:

@@ -167,10 +167,10 @@ class Panel {
 
   /** Looks that were kept. @param {string[]} names */
   fillKept(names) {
-    const button = (text, title, onclick, className = "pill") => make("button", { type: "button", className, textContent: text, title, onclick });
+    const button = (text, title, onclick, className = "pill") => make("button", { type: "button", className, textContent: text, title, ariaLabel: title, onclick });
     const remove = (name) => button("×", `forget ${name}`, () => this.live.tell("keep", { name, action: "remove" }), "close");
     at("kept").replaceChildren(...names.map((name) => make("div", { className: "row" },
-      make("span", { textContent: name }), button("use", `go on from ${name}`, () => this.use(name)), remove(name))));
+      make("span", { textContent: name }), button("use", `use ${name}`, () => this.use(name)), remove(name))));
   }
 
   /** Go on from a look that was kept. */
@@ -218,7 +218,7 @@ class Panel {
     const weight = make("input", { type: "range", min: 0, max: 2, step: 0.05, title: "weight in the mix" });
     weight.setAttribute("aria-label", `weight of ${row.name}`);
     weight.oninput = () => this.steady(`card ${row.card}`, () => tell("weight", { weight: +weight.value }));
-    const close = make("button", { type: "button", className: "close", textContent: "×", title: "remove", onclick: () => tell("remove") });
+    const close = make("button", { type: "button", className: "close", textContent: "×", title: "remove", ariaLabel: `remove ${row.name}`, onclick: () => tell("remove") });
     const node = make("div", { className: "card" }, alone, make("span", { textContent: row.name }), weight, close);
     return Object.assign(node, { weight });
   }
@@ -237,7 +237,7 @@ class Panel {
       onclick: () => tell(set ? "free" : action, { card }),
     });
     const ruled = (action, card) => picked.rules.some((rule) => rule.action === action && rule.card === card);
-    const close = make("button", { type: "button", className: "close", textContent: "×", title: "close", onclick: () => tell("close") });
+    const close = make("button", { type: "button", className: "close", textContent: "×", title: "close", ariaLabel: "close", onclick: () => tell("close") });
     const head = make("p", {}, make("b", { textContent: "This thing" }), ` ${(100 * picked.share).toFixed(1)} % of the scene`, close);
     const taken = new Map(picked.taken.map((row) => [row.name, row.share]));
     const rows = shelf.map(({ name, card }) => {
@@ -268,7 +268,7 @@ class Panel {
 
   /** The buttons of a keyframe. */
   key(key, number) {
-    const button = (text, title, onclick) => make("button", { type: "button", textContent: text, title, onclick });
+    const button = (text, title, onclick) => make("button", { type: "button", textContent: text, title, ariaLabel: `key ${number + 1}: ${title}`, onclick });
     return make("span", { className: "key" },
       button(number + 1, "go there", () => this.live.place.go(this.live.keyed(key))),
       button("‹", "earlier", () => this.live.tell("key", { action: "earlier", at: number })),

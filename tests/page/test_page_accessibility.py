@@ -1,0 +1,98 @@
+"""The start page, a scene and a file by axe: WCAG 2.2 A and AA, in both themes. Skipped where playwright, a Chromium
+or axe (the package `axe-playwright-python`) is not there.
+"""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chromium import chromium
+from pages import seen, written
+from splat_ball import ball
+
+from fprf.page import EXAMPLES
+from fprf.page.server import Access, ViewerServer
+from fprf.page.session import Viewed
+from fprf.page.start import Start
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+RULES = {
+    "runOnly": {
+        "type": "tag",
+        "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"],
+    },
+    "rules": {"target-size": {"enabled": True}},
+}
+
+
+@pytest.fixture(params=["light", "dark"])
+def page(request: pytest.FixtureRequest) -> Iterator[Any]:
+    with chromium() as browser:
+        context = browser.new_context(
+            color_scheme=request.param,
+            viewport={"width": 1280, "height": 800},
+            reduced_motion="reduce",
+            bypass_csp=True,
+        )
+        yield context.new_page()
+
+
+def violations(page: Any) -> list[str]:
+    """What axe finds, a line each element."""
+    package = pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
+    page.evaluate((Path(package.__file__).parent / "axe.min.js").read_text("utf-8"))
+    found = []
+    for rule in page.evaluate("(rules) => axe.run(document, rules)", RULES)["violations"]:
+        for node in rule["nodes"]:
+            summary = " ".join((node["failureSummary"] or "").split())[:200]
+            found.append(f"{rule['id']}: {node['html'][:110]}: {summary}")
+    return found
+
+
+def test_the_start_page(page: Any, tmp_path: Path) -> None:
+    files = tmp_path / "made" / "yard" / "files"
+    files.mkdir(parents=True)
+    shutil.copyfile(EXAMPLES["night.jpg"], files / "a.jpg")
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        start = Start(tmp_path / "made", server, lambda path, name: pytest.fail("nothing is opened"))
+        server.show_start(start)
+        page.goto(server.address)
+        page.locator("#recent li").wait_for()
+        assert violations(page) == []
+        page.fill("#minutes", "9999")
+        page.keyboard.press("Tab")
+        page.locator("#fault").wait_for()
+        assert violations(page) == []
+
+
+def test_a_scene_with_all_that_unfolds(page: Any, tmp_path: Path) -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        viewed = Viewed(seen(ball(400, 2)), "ball", 1, tmp_path / "root")
+        session = server.open(lambda: viewed, warm=False)
+        page.goto(server.address)
+        page.wait_for_selector(".place.drawn", timeout=120_000)
+        assert violations(page) == []
+        for name in ("night.jpg", "sunset.jpg"):
+            session.upload(EXAMPLES[name].read_bytes(), name, join=True)
+        page.wait_for_function("() => fprf.place.splats.styles.has('Now')", timeout=120_000)
+        page.evaluate("() => document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        page.locator("#add-key").click()
+        page.fill("#keep-name", "dusk")
+        page.locator("#keep button").click()
+        page.wait_for_function("() => fprf.place.splats.styles.has('dusk')", timeout=120_000)
+        page.mouse.click(450, 400)
+        page.wait_for_function("() => fprf.live.state.picked", timeout=120_000)
+        page.keyboard.press("?")
+        page.evaluate("() => { say('something is wrong', true); say('a note'); wait('x', 'working', 0.5); }")
+        page.wait_for_timeout(1000)
+        assert violations(page) == []
+        page.evaluate("() => { at('said').replaceChildren(); question('Really?', { Yes() {} }); }")
+        assert violations(page) == []
+
+
+def test_a_file(page: Any, tmp_path: Path) -> None:
+    page.goto(written(tmp_path / "page.html", seen(ball(500))).as_uri())
+    page.wait_for_selector(".place.ready", timeout=120_000)
+    assert violations(page) == []
