@@ -305,7 +305,7 @@ class TrainedScene:
         views = known.test or known.train
         look = None
         if styled is not None:
-            look = (" + ".join(Path(name).stem for name in self.references) or "style", styled.restyle)
+            look = (_style_name(self.references), self.trained.scene.restyled(styled.restyle))
         return notebook_html(self.trained.scene, known.name, views[len(views) // 2], look)
 
     def render(self, camera: Cameras | int | str) -> Shot:
@@ -366,6 +366,11 @@ class TrainedScene:
         if len(one) != 1:
             raise UsageError(f"{what}: {len(one)} cameras; give one, or render them all with `film`")
         return one
+
+
+def _style_name(references: Sequence[Path | str]) -> str:
+    """What a style is called on a page."""
+    return " + ".join(Path(name).stem for name in references) or "style"
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,6 +473,23 @@ class FinishedCapture:
         shapes.
         """
         return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics, references=())
+
+    def _repr_html_(self) -> str:
+        """The capture in a notebook: a page to walk through, which opens in its style."""
+        from .page.writer import notebook_html
+
+        seen = self.seen or cache(lambda: open_captures([self.capture.path], self.look, first=self.capture))
+        scene = seen().scene
+        name = self.capture.path.stem
+        look = None
+        if self.harmonics is not None:
+            drawn = self.gaussians.select(self.capture.gaussians.finite)
+            if len(drawn) == len(scene.gaussians):
+                shown = replace(scene, gaussians=scene.gaussians.recoloured(drawn.harmonics))
+                look = (_style_name(self.references), shown)
+            else:
+                name = f"{name}, as captured: a sample of {len(drawn)} Gaussians"
+        return notebook_html(scene, name, 0, look)
 
     def write(self, path: PathLike, *, overwrite: bool = False) -> list[str]:
         """Write a file, whole or not at all; its ending says the format. Returns what the format does not

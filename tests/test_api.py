@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from splat_ball import ball
 from tiny_world import World
 
 import fprf
@@ -21,6 +22,7 @@ from fprf.errors import CheckpointError, ConfigError, DataError, FprfError, Usag
 from fprf.io.memory_pictures import photograph_files
 from fprf.progress import Progressed
 from fprf.rendering.cameras import project
+from fprf.splats.files import write_gaussians
 from fprf.style.config import StyleConfig
 
 
@@ -136,6 +138,16 @@ def test_a_notebook_shows_the_scene_as_a_page(scene: TrainedScene, world: World)
         page = html.unescape(frame.partition('srcdoc="')[2].partition('" sandbox')[0])
         data = json.loads(page.partition('id="data">')[2].partition("</script>")[0])
         assert [style["name"] for style in data["styles"]] == names
+
+
+def test_a_notebook_shows_a_capture_as_a_page_that_opens_in_its_style(world: World, tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "ball.ply", ball(300, 1))
+    capture = fprf.read(tmp_path / "ball.ply")
+    styled = capture.restyled([world.references[0]])
+    for shown, names in ((capture, ["Captured"]), (styled, ["Captured", "dusk"])):
+        page = html.unescape(shown._repr_html_().partition('srcdoc="')[2].partition('" sandbox')[0])
+        data = json.loads(page.partition('id="data">')[2].partition("</script>")[0])
+        assert [style["name"] for style in data["styles"]] == names and data["scene"]["count"] == 300
 
 
 @pytest.mark.parametrize("method", [TrainedScene.stylize, FinishedCapture.restyled])

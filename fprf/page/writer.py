@@ -26,7 +26,6 @@ from ..rendering.paths import upwards
 from ..scenes import Scene
 from ..splats.pinholes import camera_of, covering
 from ..splats.scene import SplatScene
-from ..style.look import Restyle
 from . import css, read_asset, script
 from .pack import Packed, colour_header, colour_section, header, pack, sections
 
@@ -57,6 +56,8 @@ _FITTED_SHARE = 0.98
 """Share kept of the Gaussians that would fit by the mean: what shows most compresses least."""
 _MAX_FITTING_ROUNDS = 16
 """Times that a page is packed until it is small enough; each comes nearer."""
+_MAX_NOTEBOOK_MEGABYTES = 32.0
+"""Size of a page in a notebook, which is saved with it; by eye."""
 _MAX_MEDIAN_GAUSSIANS = 100_000
 """Gaussians that a median distance is taken of: enough for a median."""
 
@@ -159,18 +160,21 @@ def page_html(
     raise DataError(f"{path}: {sizes}; allow more than {megabytes:g} MiB")
 
 
-def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Restyle] | None) -> str:
-    """A page of a scene, as captured or in a style with its name, in an iframe; its stage is all of it."""
+def notebook_html(scene: Scene, name: str, view: int, styled: tuple[str, Scene] | None) -> str:
+    """A page of a scene, as captured or in a style with its name, in an iframe; its stage is all of it. Gaussians
+    that show least are left out of one that is too large for a notebook.
+    """
     gaussians = scene if isinstance(scene, SplatScene) else None
     styles = []
     if styled is not None:
-        shown = scene.restyled(styled[1])
+        shown = styled[1]
         harmonics = None
         if isinstance(shown, SplatScene):
             harmonics = shown.shown.harmonics
         styles = [Style(styled[0], [to_uint8(shown.render(scene.cameras, view).rgb)], harmonics)]
     views = [PageView(scene.names[view], to_uint8(scene.render(scene.cameras, view).rgb))]
-    text, _ = page_html(Page(title=name, facts={}, views=views, styles=styles, scene=gaussians, start=view))
+    page = Page(title=name, facts={}, views=views, styles=styles, scene=gaussians, start=view)
+    text, _ = page_html(page, megabytes=_MAX_NOTEBOOK_MEGABYTES, path=Path("notebook"))
     # Scripts without this page's origin: they reach nothing of the notebook.
     return f'<iframe srcdoc="{escape(text)}" sandbox="allow-scripts" width="100%" height="620" style="border:0"></iframe>'
 
