@@ -5,6 +5,7 @@ import threading
 import zipfile
 import zlib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from session_helpers import Listener, camera_of
+from session_helpers import Listener, camera_of, until
+from splat_ball import ball
 from tiny_world import World
 
+from fprf.cli import view
 from fprf.errors import DataError, FprfError, UsageError
 from fprf.page import messages
 from fprf.page.messages import SHELF
@@ -22,7 +25,7 @@ from fprf.page.render_worker import Steps
 from fprf.page.server import Access, ViewerServer
 from fprf.page.session import SAVED_FORMATS, Session, view_of_run
 from fprf.page.state import MAX_UNDONE_PHOTOGRAPHS, SharedState
-from fprf.splats.files import read_capture
+from fprf.splats.files import read_capture, write_gaussians
 from fprf.training.loading import open_run
 
 
@@ -328,3 +331,31 @@ def test_a_picture_of_a_field_is_what_is_shown_at_any_size(session: Session, wor
     wiped = picture(wipe=0.5)
     assert plain.shape == (96, 128, 3) and np.abs(plain.astype(int) - now).mean() > 2
     assert np.array_equal(wiped[:, :64], plain[:, :64]) and np.array_equal(wiped[:, 64:], now[:, 64:])
+
+
+def test_what_takes_its_time_is_told_with_its_share(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_gaussians(tmp_path / "ball.ply", ball(300, 1))
+    told: list[dict[str, Any]] = []
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        post = server.post
+
+        def recorded(client: Any, kind: str, message: Any) -> None:
+            if isinstance(message, dict) and message["type"] == "wait":
+                told.append(message)
+            post(client, kind, message)
+
+        monkeypatch.setattr(server, "post", recorded)
+        config = view.ViewConfig(output=tmp_path / "out")
+        session = server.open(partial(view._load, config, server.wait, tmp_path / "ball.ply"), warm=False)
+        session.upload(world.references[0].read_bytes(), "dusk.png")
+        until(lambda: "colours Now" in {kind for kind, _ in session.hello()})
+        words = [message["what"] for message in told if message["kind"] == "opening"]
+        assert words[0] == "Reading ball.ply" and "300 Gaussians" in words[1] and words[-1] == ""
+        looking = [message for message in told if message["kind"] == "looking"]
+        assert any("3 of" in message["what"] and 0 < message["share"] < 1 for message in looking)
+        photograph = [message["share"] for message in told if message["kind"] == "photograph"]
+        assert photograph == [0.0, 1 / 3, 2 / 3, None]
+        until(lambda: not server._waits)
