@@ -36,4 +36,4 @@ def css(*more: str) -> str:
 
 def script(*more: str) -> str:
     """The scripts of every page, and `more`, one after the other."""
-    return "\n".join(map(read_asset, ("splats.js", "place.js", "page.js", *more)))
+    return "\n".join(map(read_asset, ("splats.js", "place.js", "send.js", "page.js", *more)))

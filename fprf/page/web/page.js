@@ -40,6 +40,7 @@ class Pictures {
 }
 
 const MOST_SHOWN = 4; // photographs beside a style that is of several; by eye
+const PANELS = { see: "seeing", send: "sending", how: "help" }; // buttons and what they open
 const SWEEP_MS = 4200; // that the line takes on its way across, once; by eye
 
 // One plain sentence on the stage, where it cannot be what it should be; without words there is none.
@@ -62,7 +63,10 @@ class Stage {
     at("reset").onclick = () => this.place.home();
     at("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : this.root.requestFullscreen?.());
     at("full").hidden = !this.root.requestFullscreen;
-    at("how").onclick = () => { at("help").hidden = !at("help").hidden; };
+    this.sending = new Sending(this);
+    if (place instanceof Place) this.seeing = new Seeing(place);
+    at("see").hidden = !this.seeing;
+    for (const id of Object.keys(PANELS)) at(id).onclick = () => this.unfold(id);
     const handle = at("line");
     const drag = (event) => {
       const box = this.root.querySelector(".view").getBoundingClientRect();
@@ -164,6 +168,17 @@ class Stage {
     handle.dataset.right = to;
   }
 
+  // Open the panel of a button, or close it; one is open at a time.
+  unfold(id) {
+    for (const [button, panel] of Object.entries(PANELS)) {
+      const open = button === id && at(panel).hidden;
+      at(panel).hidden = !open;
+      at(button).setAttribute("aria-expanded", String(open));
+    }
+    this.sending.fill();
+    this.seeing?.fill();
+  }
+
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.("input:not([type=range]), select, textarea")) return;
     const digit = /^Digit(\d)$/.exec(event.code);
@@ -173,9 +188,9 @@ class Stage {
     else if (event.code === "KeyC") this.compare();
     else if (event.code === "KeyV") this.place.step(event.shiftKey ? -1 : 1);
     else if (event.code === "KeyR") this.place.home();
-    else if (event.key === "?" || event.code === "KeyH") at("help").hidden = !at("help").hidden;
+    else if (event.key === "?" || event.code === "KeyH") this.unfold("how");
     else if (event.key === "Escape") {
-      at("help").hidden = true;
+      this.unfold(null);
       this.listeners.escape?.();
     } else return;
     event.preventDefault();
@@ -231,7 +246,8 @@ const open = async (data) => {
       await new Promise((done) => setTimeout(done, 0)); // a picture between two styles
     }
     stage.add(styles[k]);
-    if (k === 1) stage.begin(styles[k].name);
+    if (k === 1 && !location.hash) stage.begin(styles[k].name);
   }
+  if (location.hash && !stage.sending.read() && styles[1]) stage.begin(styles[1].name);
   root.classList.add("ready");
 };

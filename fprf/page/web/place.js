@@ -3,6 +3,9 @@
 const FRAME = 90; // milliseconds that a frame of a moving camera may take
 const REST = 220; // milliseconds without a move, after which the exact picture is drawn
 const SHARES = [1, 0.75, 0.5, 0.35, 0.25];
+const TURN_SPEED = 0.12; // radians a second of a scene that turns by itself; by eye
+const SWING = 0.3; // radians to either side where it is not turned all the way round; by eye
+const AROUND_SHARE = 0.5; // length of the mean direction of cameras, below which they stand around something; by eye
 const EDGE = 4096; // pixels a side of the canvas, at most
 const CLICK_MS = 280; // until a click is known not to be the first half of a double click; by eye
 
@@ -31,9 +34,9 @@ class Camera {
 
   // fx fy cx cy for a canvas on which all of the photograph is to be seen: above a strip of such a share (`below`) and, the more
   // it `fills`, the larger and the less of it: from 0 to 1, where nothing is seen but the photograph.
-  fitted(width, height, { below = 0, fills = 0 } = {}) {
+  fitted(width, height, { below = 0, fills = 0, zoom = 1 } = {}) {
     const [w, h] = this.size, free = height * Math.max(1 - below, 0.5), [fx, fy, cx, cy] = this.lens;
-    const by = Math.min(width / w, free / h) ** (1 - fills) * Math.max(width / w, free / h) ** fills;
+    const by = zoom * Math.min(width / w, free / h) ** (1 - fills) * Math.max(width / w, free / h) ** fills;
     return [fx * by, fy * by, width / 2 + (cx - w / 2) * by, free / 2 + (cy - h / 2) * by];
   }
 
@@ -95,6 +98,7 @@ class Place {
         this.listeners.lost?.(false);
       });
     }
+    Object.assign(this, { zoom: 1, speed: 1, orbiting: false });
     this.fading = true; // what no photograph saw, into the background
     this.readSky();
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.readSky());
@@ -113,7 +117,7 @@ class Place {
     this.touch();
   }
 
-  get lens() { return this.camera.fitted(this.canvas.width, this.canvas.height, { below: this.below, fills: this.scene.fills }); }
+  get lens() { return this.camera.fitted(this.canvas.width, this.canvas.height, { below: this.below, fills: this.scene.fills, zoom: this.zoom }); }
   get look() { return { first: this.first ?? this.second, second: this.second ?? this.first, blend: this.blend, wipe: this.wipe }; }
 
   // Something else is to be seen: `moved` where the camera is another one.
@@ -311,12 +315,22 @@ class Place {
     addEventListener("blur", () => this.keys.clear());
   }
 
+  // Turn by itself: all the way round what cameras stand around, else to and fro before it.
+  turnOn(now, seconds) {
+    const ahead = this.scene.cameras.map((each) => new Camera(each).axes[2]).reduce((sum, axis) => plus(sum, axis));
+    const around = Math.hypot(...ahead) < AROUND_SHARE * this.scene.cameras.length;
+    const speed = around ? 1 : Math.cos((now - this.orbiting) / 1000 * TURN_SPEED / SWING);
+    this.camera.orbit(this.scene.up, TURN_SPEED * seconds * speed, 0);
+    this.keep();
+  }
+
   // Keys that are held.
   fly(now) {
     const seconds = Math.min(0.1, (now - (this.last ?? now)) / 1000);
     this.last = now;
+    if (this.orbiting && !this.keys.size && !this.flight) this.turnOn(now, seconds);
     if (!this.keys.size) return;
-    const by = seconds * this.camera.distance * 0.6;
+    const by = seconds * this.camera.distance * 0.6 * this.speed;
     for (const code of this.keys) {
       const [kind, a, b, c] = KEYS[code];
       if (kind === "turn") this.camera.orbit(this.scene.up, a * seconds, b * seconds, this.scene.within ? 0 : this.camera.distance);

@@ -141,9 +141,10 @@ void main() {
   o = vec4(smoothstep(0., 1., sum / needed));
 }`;
 const SHOW = `${COMMON}
-uniform sampler2D picture, cover; uniform vec2 scale, whole; uniform float height; uniform vec3 background, rim; uniform bool faded; out vec4 o;
+uniform sampler2D picture, cover; uniform vec2 scale, whole, corner; uniform vec3 background, rim; uniform bool faded; out vec4 o;
 void main() {
-  vec2 at = vec2(gl_FragCoord.x, height - gl_FragCoord.y);
+  vec2 at = gl_FragCoord.xy - corner;
+  at.y = whole.y - at.y;
   vec4 c = texture(picture, at * scale / vec2(textureSize(picture, 0)));
   if (faded) c *= texture(cover, at / whole).r;
   // The background: lighter behind the middle of the picture; eight bits would show its steps without the noise.
@@ -373,9 +374,9 @@ class Splats {
 
   // Draw into the canvas at a share of its resolution. `look`: first and second style, blend in [0, 1], wipe in [0, 1] or -1.
   // `background` becomes `rim` away from the middle; what no photograph saw fades where `depth` is given, the distance of what they
-  // look at.
-  draw(view, lens, look, { near = 0.01, background = [0, 0, 0], rim = background, depth = 0, share = 1, exact = true } = {}) {
-    const gl = this.gl, { width, height } = this.canvas;
+  // look at. `into` is a framebuffer and a box of it, in the place of the canvas.
+  draw(view, lens, look, { near = 0.01, background = [0, 0, 0], rim = background, depth = 0, share = 1, exact = true, into = null } = {}) {
+    const gl = this.gl, { width, height } = into?.box ?? this.canvas;
     const small = [Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height))];
     const scale = [small[0] / width, small[1] / height], scaled = [lens[0] * scale[0], lens[1] * scale[1], lens[2] * scale[0], lens[3] * scale[1]];
     const target = this.frame(...small, exact && this.formats.exact !== this.formats.coarse ? "exact" : "coarse");
@@ -383,8 +384,8 @@ class Splats {
     const faded = Boolean(depth && this.deep && this.head.seen?.length);
     const cover = faded ? this.cover(target, view, scaled, depth) : target;
     const { program, places } = this.programs.show;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into?.buffer ?? null);
+    gl.viewport(into?.box.x ?? 0, into?.box.y ?? 0, width, height);
     gl.disable(gl.BLEND);
     gl.useProgram(program);
     [target, cover].forEach(({ picture }, i) => { gl.activeTexture(gl.TEXTURE0 + i); gl.bindTexture(gl.TEXTURE_2D, picture); });
@@ -393,7 +394,7 @@ class Splats {
     gl.uniform1i(places.faded, faded ? 1 : 0);
     gl.uniform2f(places.scale, ...scale);
     gl.uniform2f(places.whole, width, height);
-    gl.uniform1f(places.height, height);
+    gl.uniform2f(places.corner, into?.box.x ?? 0, into?.box.y ?? 0);
     gl.uniform3f(places.background, ...background);
     gl.uniform3f(places.rim, ...rim);
     gl.bindVertexArray(this.quads);
