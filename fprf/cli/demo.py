@@ -38,7 +38,7 @@ class DemoConfig(OverwriteConfig):
     """Training time."""
     downscale: int | float = 1
     """The photographs, 356x634, are reduced by this factor."""
-    megabytes: float = 4.0
+    megabytes: float = 3.8
     """Size of the page, at most; Gaussians that show least are left out of it."""
 
     def __post_init__(self) -> None:

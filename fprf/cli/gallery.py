@@ -45,6 +45,10 @@ class GalleryConfig(StyledRunConfig):
     """Size of the page, at most; Gaussians that show least are left out of it."""
     output: Path | None = None
     """The page; by default RUN/gallery.html."""
+    address: str = ""
+    """Where the page will lie on the web (https://HOST/garden.html): chats then show the picture that is written
+    beside it.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,6 +61,11 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         GalleryConfig(), args, prog="fprf gallery", description=_GALLERY_HELP, positional=("run",)
     )
+    from ..datamanagers.images import load_preview
+    from ..page.writer import REFERENCE_PIXELS, Page, Reference, preview_of, write_page
+    from ..splats.scene import SplatScene
+    from ..training.loading import open_run
+
     if config.output is None:
         output = config.run / "gallery.html"
     else:
@@ -64,12 +73,8 @@ def run(args: list[str]) -> int:
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     origin = origin_of("gallery", config, file)
-    origin.check([output])
-    from ..datamanagers.images import load_preview
-    from ..page.writer import REFERENCE_PIXELS, Page, Reference, write_page
-    from ..splats.scene import SplatScene
-    from ..training.loading import open_run
-
+    outputs = [output, preview_of(output)] if config.address else [output]
+    origin.check(outputs)
     opened = open_run(config.run, config.device, config)
     known = opened.known
     scene = opened.scene
@@ -101,8 +106,9 @@ def run(args: list[str]) -> int:
         references=[Reference(name, load_preview(path, REFERENCE_PIXELS)) for path, name in called.items()],
         scene=scene if isinstance(scene, SplatScene) else None,
         start=views[0],
+        address=config.address,
     )
-    with origin.writing([output]):
+    with origin.writing(outputs):
         write_page(output, page, megabytes=config.megabytes)
     print(f"{len(views)} views in {len(styles)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
     return 0

@@ -22,6 +22,7 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
+import numpy as np
 import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -34,6 +35,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
+from ..io.images import Picture
 from . import EXAMPLES, css, read_asset, script
 from .messages import PictureRequest, StartRequest, read_message
 from .start import Start
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 _MIN_TOKEN_CHARACTERS = 16
 """Characters of a token that a user chooses, at least; by eye."""
+_MAX_HASH_CHARACTERS = 400
+"""Characters of a link behind its #, at most: a view and the name of a style."""
 _ANY_ADDRESS = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
 _MAX_WAIT_SECONDS = 15.0
 """Time for a request's head, for each further piece of a body, and for each piece of a response to be
@@ -159,6 +163,14 @@ def network_address(host: str) -> str:
             return str(probe.getsockname()[0])
         except OSError:
             return here
+
+
+def qr_code(text: str) -> Picture:
+    """A text as a QR code with its quiet border, a pixel a module."""
+    import cv2
+
+    modules = np.asarray(cv2.QRCodeEncoder.create().encode(text), np.uint8)
+    return np.repeat(np.pad(modules, 1, constant_values=255)[..., None], 3, 2)
 
 
 def is_loopback(host: str) -> bool:
@@ -456,6 +468,8 @@ class ViewerServer:
             Route("/scene", self._scene),
             Route("/colours", self._colours),
             Route("/card", self._card),
+            Route("/address", self._address),
+            Route("/code", self._code),
             Route("/examples/{name}", self._example),
             Route("/gaussians", self._gaussians),
             Route("/film", self._film),
@@ -529,6 +543,24 @@ class ViewerServer:
 
         photograph = self.session.state.photograph(_integer(request, "card"))
         return Response(encode(photograph.thumbnail, "webp"), media_type="image/webp")
+
+    def _shared(self) -> str:
+        """The address of the page for other machines, with the token. Raises HTTPException where this machine
+        alone may connect.
+        """
+        if is_loopback(self.access.host):
+            raise HTTPException(404, "this machine alone may connect; --host lets others")
+        return self.address
+
+    async def _address(self, request: Request) -> Response:
+        return Response(self._shared(), media_type="text/plain")
+
+    async def _code(self, request: Request) -> Response:
+        """A picture of the address as a QR code, with what stands behind its #."""
+        from ..io.images import encode
+
+        behind = request.query_params.get("hash", "")[:_MAX_HASH_CHARACTERS]
+        return Response(encode(qr_code(f"{self._shared()}#{behind}"), "png"), media_type="image/png")
 
     async def _example(self, request: Request) -> Response:
         path = EXAMPLES.get(request.path_params["name"])

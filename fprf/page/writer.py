@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..errors import DataError, UsageError
 from ..io.atomic import write_text
-from ..io.images import Picture, data_uri, shrink, to_uint8
+from ..io.images import Picture, data_uri, shrink, to_uint8, write_image
 from ..io.maps import palette
 from ..rendering.cameras import Cameras
 from ..rendering.paths import upwards
@@ -36,6 +36,8 @@ _VIEW_PIXELS = 512
 """Longest side of a view below it; by eye."""
 _MATCH_MAP_PIXELS = 320
 """Longest side of a match map; by eye."""
+_PREVIEW_PIXELS = 1200
+"""Longest side of the picture that chats show of a page, at most: what they take."""
 _THUMBNAIL_PIXELS = 96
 """Longest side of a reference beside its style: twice as many as it takes there."""
 REFERENCE_PIXELS = 320
@@ -112,15 +114,26 @@ class Page:
     start: int = 0
     """Camera of the scene that the stage begins at."""
     credits: Sequence[str] = ()
+    address: str = ""
+    """Where it will lie on the web (https://…/garden.html): chats show the picture beside it."""
+
+
+def preview_of(path: Path) -> Path:
+    """The picture beside a page, which chats show of it."""
+    return path.with_suffix(".jpg")
 
 
 def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int:
-    """Write the page to `path` (.html), whole or not at all; return how many Gaussians it shows.
+    """Write the page to `path` (.html), whole or not at all, and a preview beside it where the page has an
+    address; return how many Gaussians it shows.
 
     With `megabytes` (2^20 bytes), Gaussians that show least are left out until the file is no larger. Raises
     DataError where a page of hardly any Gaussian is larger, UsageError where two looks have one name.
     """
     text, count = page_html(page, megabytes=megabytes, path=path)
+    if page.address:
+        picture = page.styles[0].stills[0] if page.styles else page.views[0].original
+        write_image(preview_of(path), shrink(picture, _PREVIEW_PIXELS))
     write_text(path, text)
     return count
 
@@ -336,6 +349,8 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
     return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
+        description=escape(page.lead or "A place in 3D, in the light and colours of photographs."),
+        preview=_preview(page.address),
         lead=f'<p class="lead">{escape(page.lead)}</p>' if page.lead else "",
         css=css(),
         hash=f"'sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}'",
@@ -351,6 +366,18 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
         sections="\n".join(scripts),
         script=code,
+    )
+
+
+def _preview(address: str) -> str:
+    """Tags of a page's address and its picture; chats load nothing that lies in the page itself."""
+    if not address:
+        return ""
+    base = escape(address.rpartition(".")[0])
+    return (
+        f'<meta property="og:url" content="{escape(address)}">\n'
+        f'<meta property="og:image" content="{base}.jpg">\n'
+        '<meta name="twitter:card" content="summary_large_image">'
     )
 
 

@@ -330,3 +330,99 @@ def test_the_background_is_a_gradient_of_the_theme(browser: Any, tmp_path: Path)
     assert light[corner].mean() > 0.6 and dark[corner].mean() < 0.25
     assert light[middle].std() > 0 and np.ptp(light[:, 5].mean(-1)) > 0.02
     assert page.errors == []
+
+
+def test_a_link_holds_view_and_style(browser: Any, tmp_path: Path) -> None:
+    path = written(tmp_path / "page.html", seen(ball(500)))
+    page = opened(browser, path)
+    page.keyboard.press("2")
+    page.evaluate("() => { fprf.place.camera.orbit(fprf.place.scene.up, 0.4, 0.1); fprf.place.zoom = 1.5; }")
+    page.locator("#send").click()
+    link = page.locator("#link").input_value()
+    assert link.startswith(path.as_uri() + "#v=") and link.endswith("&s=plain")
+    embed = page.locator("#embed").input_value()
+    assert embed.startswith("<iframe src=") and 'allow="fullscreen' in embed
+    pose = page.evaluate(POSE)
+    other = browser.new_page(viewport={"width": 640, "height": 480})
+    other.goto(link)
+    other.wait_for_selector(".place.ready", timeout=120_000)
+    assert np.allclose(other.evaluate(POSE), pose, atol=1e-3)
+    assert other.evaluate("() => [fprf.stage.to, fprf.stage.wiping, fprf.place.zoom]") == [
+        "plain",
+        False,
+        1.5,
+    ]
+    other.goto(path.as_uri() + "#v=1,2&s=nothing")  # not ours: it begins as any page
+    other.reload()
+    other.wait_for_selector(".place.ready", timeout=120_000)
+    assert other.evaluate("() => fprf.stage.to") == "dusk"
+    assert page.errors == []
+
+
+def test_angle_speed_fading_and_turning_are_set(page: Any) -> None:
+    page.locator("#see").click()
+    lens = page.evaluate("() => fprf.place.lens[1]")
+    page.locator("#angle").fill("80")
+    assert page.evaluate("() => fprf.place.canvas.height / 2 / fprf.place.lens[1]") == pytest.approx(
+        np.tan(np.radians(40)), rel=0.01
+    )
+    assert page.evaluate("() => fprf.place.lens[1]") != lens
+    page.locator("#speed").fill("3")
+    page.locator("#fading").uncheck()
+    assert page.evaluate("() => [fprf.place.speed, fprf.place.fading]") == [3, False]
+    before = page.evaluate(POSE)
+    page.locator("#orbiting").check()
+    page.wait_for_function(
+        "(v) => Math.abs(fprf.place.camera.view[12] - v[12]) + Math.abs(fprf.place.camera.view[0] - v[0]) > 1e-3",
+        arg=before,
+    )
+    page.locator("#canvas").click(position={"x": 40, "y": 240})
+    assert not page.locator("#orbiting").is_checked()
+    page.keyboard.press("Escape")
+    assert not page.locator("#seeing").is_visible()
+
+
+HEADSET = """
+class XRWebGLLayer {
+  constructor() { this.framebuffer = null; }
+  getViewport(eye) { return { x: eye.eye === "left" ? 0 : 160, y: 0, width: 160, height: 200 }; }
+}
+window.XRWebGLLayer = XRWebGLLayer;
+WebGL2RenderingContext.prototype.makeXRCompatible = async () => {};
+const matrix = (x) => ({ matrix: new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, x, 0, 0, 1]) });
+const projectionMatrix = new Float32Array([2, 0, 0, 0, 0, 1.6, 0, 0, 0, 0, -1, -1, 0, 0, -0.1, 0]);
+const views = ["left", "right"].map((eye, i) => ({ eye, projectionMatrix, transform: matrix(i ? 0.2 : -0.2) }));
+const session = Object.assign(new EventTarget(), {
+  renderState: {},
+  updateRenderState(state) { Object.assign(this.renderState, state); },
+  requestReferenceSpace: async () => ({}),
+  requestAnimationFrame(step) {
+    requestAnimationFrame(() => step(0, { getViewerPose: () => ({ transform: matrix(0), views }) }));
+  },
+});
+window.session = session;
+const xr = { isSessionSupported: async () => true, requestSession: async () => session };
+Object.defineProperty(navigator, "xr", { value: xr });
+"""
+
+
+def test_a_headset_gets_a_picture_for_either_eye(browser: Any, tmp_path: Path) -> None:
+    page = opened(browser, written(tmp_path / "page.html", seen(ball(500))), script=HEADSET)
+    page.evaluate(
+        """() => {
+          const { splats } = fprf.place, draw = splats.draw.bind(splats);
+          splats.draw = (view, lens, look, options) => {
+            draw(view, lens, look, options);
+            (fprf.eyes ??= {})[options.into?.box.x] = { x: view[12], lens };
+          };
+        }"""
+    )
+    page.locator("#see").click()
+    page.locator("#headset").click()
+    page.wait_for_function("() => fprf.eyes?.[0] && fprf.eyes?.[160]", timeout=60_000)
+    left, right = (page.evaluate(f"() => fprf.eyes[{x}]") for x in (0, 160))
+    assert left["x"] - right["x"] == pytest.approx(0.4, abs=1e-4), "eyes lie apart along the camera's right"
+    assert left["lens"] == pytest.approx([160, 160, 80, 100])
+    page.evaluate("() => session.dispatchEvent(new Event('end'))")
+    assert page.evaluate("() => fprf.place.lost") is False
+    assert page.errors == []

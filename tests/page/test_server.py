@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
 import pytest
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -242,6 +244,19 @@ def test_a_token_in_the_address_becomes_a_cookie() -> None:
         with pytest.raises(InvalidStatus) as told, opened(http):
             pass
         assert told.value.response.status_code == 403
+
+
+def test_an_address_for_others_comes_with_its_code_where_others_may_connect(http: ViewerServer) -> None:
+    assert status(http, "GET /address") == status(http, "GET /code") == 404, "this machine alone may connect"
+    with ViewerServer(Access("0.0.0.0", TOKEN), 0) as shared:
+        cookie = f"Cookie: {cookie_name(f'127.0.0.1:{shared.port}')}={TOKEN}"
+        address = request(shared, "GET /address", cookie).partition(b"\r\n\r\n")[2].decode()
+        assert address.endswith(f":{shared.port}/?token={TOKEN}")
+        picture = request(shared, "GET /code?hash=v%3D1%2C2%26s%3Dnight", cookie).partition(b"\r\n\r\n")[2]
+    modules = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+    code = cv2.resize(modules, None, fx=8, fy=8, interpolation=cv2.INTER_NEAREST)
+    text, _, _ = cv2.QRCodeDetector().detectAndDecode(cv2.copyMakeBorder(code, 32, 32, 32, 32, 0, value=255))
+    assert text == f"{address}#v=1,2&s=night"
 
 
 def opened(http: ViewerServer, **more: object) -> ClientConnection:

@@ -217,3 +217,13 @@ def test_the_maps_of_a_style_carry_its_view_dependence() -> None:
     )
     assert float((made - styled[:, 1:]).abs().max()) < 1e-4
     assert len(maps) <= 256
+
+
+def test_chats_find_a_title_and_a_picture_where_the_page_has_an_address(tmp_path: Path) -> None:
+    path = written(tmp_path / "ball.html", seen(ball(50)), address="https://example.org/a/ball.html")
+    text = path.read_text()
+    assert '<meta property="og:title" content="Ball">' in text
+    assert '<meta property="og:image" content="https://example.org/a/ball.jpg">' in text
+    assert cv2.imread(str(tmp_path / "ball.jpg")).shape[2] == 3
+    assert "og:image" not in written(tmp_path / "plain.html", seen(ball(50))).read_text()
+    assert not (tmp_path / "plain.jpg").exists()

@@ -350,6 +350,9 @@ class Live {
     this.stage.listeners.chosen = (name) => {
       if (this.state?.kept.includes(name)) this.tell("keep", { name, action: "restore" });
     };
+    this.stage.sending.read();
+    // Where others may connect, their address, and its code.
+    fetch("/address").then(async (answer) => { if (answer.ok) this.stage.sending.share(await answer.text()); }, () => {});
     window.fprf = { place: this.place, stage: this.stage, live: this };
   }
 
@@ -395,6 +398,7 @@ class Live {
     const { styles, from, to, wiping, amount } = this.stage;
     const fresh = !styles.some((style) => style.name === name);
     this.stage.add({ name });
+    if (fresh && this.stage.sending.asked === name) this.stage.choose(name);
     if (name !== "Now") return;
     // What was changed here is seen here; what others change is not thrust upon this page.
     const compared = from === name && (wiping || amount < 1);

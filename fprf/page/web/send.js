@@ -1,6 +1,12 @@
 // What one sends: a link that holds where one stands and in which style, and a page that shows the scene within another one.
 
-const VIEW_NUMBERS = 8; // of a view in a link: place, direction forward, distance of what is turned about, zoom
+const VIEW_NUMBERS = 9; // of a view in a link: place, direction forward, roll, distance of what is turned about, zoom
+
+/** Axes of a camera that looks forward without a roll: right, down, forward. */
+const levelled = (forward, up) => {
+  const right = unit(cross(forward, up));
+  return [right, cross(forward, right), forward];
+};
 
 /** The part of a link behind #: the view and the style. */
 class Sending {
@@ -13,12 +19,22 @@ class Sending {
     addEventListener("hashchange", () => this.read());
   }
 
+  /** Take the address that others open, and show its code: it comes from the server. */
+  share(address) {
+    this.address = address;
+    this.coded = true;
+  }
+
+  /** @returns {?string} the style that the link names */
+  get asked() { return new URLSearchParams(location.hash.slice(1)).get("s"); }
+
   /** @returns {string} what stands behind # for what is seen now */
   get hash() {
     const { place, to } = this.stage, parts = new URLSearchParams();
     if (place instanceof Place) {
-      const { camera, zoom } = place;
-      parts.set("v", [...camera.place, ...camera.axes[2], camera.distance, zoom].map((x) => Number(x.toPrecision(5))).join(","));
+      const { camera, zoom, scene } = place, [right, down] = levelled(camera.axes[2], scene.up);
+      const roll = Math.atan2(dot(camera.axes[0], down), dot(camera.axes[0], right));
+      parts.set("v", [...camera.place, ...camera.axes[2], roll, camera.distance, zoom].map((x) => Number(x.toPrecision(5))).join(","));
     }
     if (to) parts.set("s", to);
     return parts.toString().replaceAll("%2C", ",");
@@ -31,18 +47,17 @@ class Sending {
   read() {
     const given = new URLSearchParams(location.hash.slice(1)), { stage } = this, { place } = stage;
     const view = (given.get("v") ?? "").split(",").map(Number);
-    if (place instanceof Place && view.length === VIEW_NUMBERS && view.every(Number.isFinite) && view[6] > 0 && view[7] > 0) this.stand(view);
-    const style = stage.styles.find(({ name }) => name === given.get("s"));
+    if (place instanceof Place && view.length === VIEW_NUMBERS && view.every(Number.isFinite) && view[7] > 0 && view[8] > 0) this.stand(view);
+    const style = stage.styles.find(({ name }) => name === this.asked);
     if (style) stage.set({ to: style.name, amount: 1, wiping: false });
     return Boolean(style);
   }
 
-  /** Stand at a view of a link, upright, and no farther than one may go. */
+  /** Stand at a view of a link, no farther than one may go. */
   stand(view) {
-    const { place } = this.stage, forward = unit(view.slice(3, 6)), right = unit(cross(forward, place.scene.up));
-    if (!right.every(Number.isFinite)) return;
-    Object.assign(place.camera, { place: view.slice(0, 3), axes: [right, cross(forward, right), forward], distance: view[6] });
-    place.zoom = Math.min(8, Math.max(0.2, view[7]));
+    const { place } = this.stage, axes = levelled(unit(view.slice(3, 6)), place.scene.up);
+    Object.assign(place.camera, { place: view.slice(0, 3), axes: axes.map((axis) => turned(axis, axes[2], view[6])), distance: view[7] });
+    place.zoom = Math.min(8, Math.max(0.2, view[8]));
     place.flight = null;
     place.keep();
   }
@@ -52,6 +67,8 @@ class Sending {
     const link = `${this.address}#${this.hash}`;
     at("link").value = link;
     at("embed").value = `<iframe src="${link.replaceAll("&", "&amp;").replaceAll('"', "&quot;")}" width="100%" height="560" style="border:0" allow="fullscreen; xr-spatial-tracking" allowfullscreen></iframe>`;
+    at("code").hidden = !this.coded;
+    if (this.coded && !at("sending").hidden) at("code").src = `/code?hash=${encodeURIComponent(this.hash)}`;
   }
 
   /** Copy a field; where the browser forbids it, it is selected, to be copied by hand. */
@@ -115,6 +132,7 @@ class Headset {
     const space = await session.requestReferenceSpace("local");
     const start = place.camera.copy();
     place.lost = true; // the page draws nothing meanwhile
+    while (place.sorting) await new Promise((done) => setTimeout(done, 5)); // one sort at a time
     session.addEventListener("end", () => { place.lost = false; place.touch(); });
     const frame = (_, xr) => {
       session.requestAnimationFrame(frame);
@@ -131,7 +149,7 @@ class Headset {
       this.sorting = true;
       splats.sort(this.view(pose.transform, start), scene.near).then(() => { this.sorting = false; });
     }
-    if (!splats.kept || !splats.order) return;
+    if (!splats.kept) return;
     for (const eye of pose.views) {
       const box = layer.getViewport(eye), p = eye.projectionMatrix;
       const lens = [p[0] * box.width / 2, p[5] * box.height / 2, (1 - p[8]) * box.width / 2, (1 + p[9]) * box.height / 2];
