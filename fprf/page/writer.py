@@ -36,9 +36,9 @@ _VIEW_PIXELS = 512
 """Longest side of a view below it; by eye."""
 _MATCH_MAP_PIXELS = 320
 """Longest side of a match map; by eye."""
-_PREVIEW_PIXELS = 1200
+_CHAT_PICTURE_PIXELS = 1200
 """Longest side of the picture that chats show of a page, at most: what they take."""
-_THUMBNAIL_PIXELS = 96
+_BESIDE_STYLE_PIXELS = 96
 """Longest side of a reference beside its style: twice as many as it takes there."""
 REFERENCE_PIXELS = 320
 """Longest side of references: as match maps, which lie beside them."""
@@ -133,7 +133,7 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
     text, count = page_html(page, megabytes=megabytes, path=path)
     if page.address:
         picture = page.styles[0].stills[0] if page.styles else page.views[0].original
-        write_image(preview_of(path), shrink(picture, _PREVIEW_PIXELS))
+        write_image(preview_of(path), shrink(picture, _CHAT_PICTURE_PIXELS))
     write_text(path, text)
     return count
 
@@ -386,7 +386,7 @@ def _thumbnail(picture: Picture) -> Picture:
     if picture.shape[2] == 4:  # over white
         alpha = picture[..., 3:].astype(np.float32) / 255
         picture = (picture[..., :3] * alpha + 255 * (1 - alpha)).round().astype(np.uint8)
-    return shrink(picture, _THUMBNAIL_PIXELS)
+    return shrink(picture, _BESIDE_STYLE_PIXELS)
 
 
 def _img(picture: Picture, side: int, alt: str) -> str:
