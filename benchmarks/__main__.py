@@ -41,6 +41,11 @@ BENCHMARKS = {
         "{results}/speed_fox.json {results}/speed_fox.json",
         "two JSON files",
     ),
+    "correspondences": Benchmark(
+        "every method by the true answer at points: one place in two pictures, from two standpoints",
+        "--folder {folder}/pairs --seeds 0",
+        "the pairs of WxBS 1.1; without them it is skipped",
+    ),
     "exports": Benchmark(
         "exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED
     ),
