@@ -102,7 +102,8 @@ def run(args: list[str]) -> int:
         write_text(folder / path, text)
     quoted = shlex.quote(str(folder))
     print(f"{folder}: {_KINDS[config.kind].summary.lower()} named {name}")
-    print(f"pip install -e {quoted} && fprf plugins --check && pytest {quoted}")
+    package = shlex.quote(f"{folder}[test]")
+    print(f"pip install -e {package} && fprf plugins --check && pytest {quoted}")
     return 0
 
 
