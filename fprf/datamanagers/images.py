@@ -34,9 +34,8 @@ from .image_files import (
     open_image,
     opened,
     read_header,
-    silent,
 )
-from .raw import RAW_SUFFIXES
+from .raw import RAW_SUFFIXES, silent
 
 if TYPE_CHECKING:
     from .scene import ParsedScene
