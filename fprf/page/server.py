@@ -66,8 +66,6 @@ _MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
 _MAX_QUERY_FIELDS = 16
 """Fields of an address; the page sends four."""
-_PREVIEW_PIXELS = 320
-"""Longest side of a picture in the list of scenes; by eye."""
 _SENT_BYTES = 1 << 16
 """Bytes of a piece of a response, which has to be accepted in time."""
 _LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
@@ -622,14 +620,10 @@ class ViewerServer:
         return JSONResponse({})
 
     async def _preview(self, request: Request) -> Response:
-        from ..datamanagers.images import load_preview
-        from ..io.images import encode
-
-        path = self.start.preview(request.query_params.get("name", ""))
-        if path is None:
+        data = await asyncio.to_thread(self.start.preview, request.query_params.get("name", ""))
+        if data is None:
             raise HTTPException(404, "no picture of this scene yet")
-        picture = await asyncio.to_thread(load_preview, path, _PREVIEW_PIXELS)
-        return Response(encode(picture, "webp"), media_type="image/webp")
+        return Response(data, media_type="image/webp")
 
     async def _start_request(self, request: Request) -> Response:
         asked = read_message(await self.body(request), StartRequest)

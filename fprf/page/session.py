@@ -527,7 +527,9 @@ class Session:
                 self.notify("style: masks, strengths of regions and a second style are left out here")
             photographs = []
             for reference in file.style.references:
-                photographs.append(self._given(reference, file.sha256.get(reference)))
+                # Beside the file alone: no request names a path of this machine.
+                beside = folder / reference.name
+                photographs.append(self._given(beside, file.sha256.get(reference)))
 
             def add() -> None:
                 found = []

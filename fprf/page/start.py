@@ -26,7 +26,7 @@ from ..datamanagers.images import IMAGE_SUFFIXES
 from ..errors import DataError, FprfError, UsageError
 from . import GARDEN
 from .messages import Discard, Leave, Make, New, Open, Remove, Rename, StartRequest, Stop
-from .uploads import SceneFiles, Source, find_source, is_capture, newest_step, training_progress
+from .uploads import SceneFiles, Source, Uploads, find_source, is_capture, newest_step, training_progress
 
 if TYPE_CHECKING:
     from .server import ViewerServer
@@ -44,6 +44,8 @@ _MAX_EXIT_SECONDS = 10.0
 """Seconds that a process has to save and end; by eye."""
 _MAX_SILENT_SECONDS = 60.0
 """Without a piece of a file, after which a page that was sending has given up; by eye."""
+_PREVIEW_PIXELS = 320
+"""Longest side of a picture in the list of scenes; by eye."""
 _INCOMING_FOLDER = ".incoming"
 """Files that are being sent: they get their place when a scene is made of them."""
 _PREVIEW = Path("page", "preview.png")
@@ -89,6 +91,9 @@ class Start:
         """When a piece of a file came last, by `time.monotonic`."""
         self._sending = ""
         """Scene whose files are coming."""
+        self._decoder: Uploads | None = None
+        self._preview_lock = threading.Lock()
+        self._pictures: dict[tuple[Path, int], bytes] = {}
         self._previews: dict[str, Path] = {}
         """Where scenes of the list lie, by name."""
         self._progress = StartProgress()
@@ -108,6 +113,8 @@ class Start:
                 self._thread.join(_MAX_EXIT_SECONDS)
         shutil.rmtree(self._incoming, ignore_errors=True)
         self._remove_empty()
+        if self._decoder is not None:
+            self._decoder.close()
 
     def state(self) -> dict[str, Any]:
         """How far it is, as the page reads it; idle, what can be opened."""
@@ -261,8 +268,31 @@ class Start:
             raise UsageError(f"{name} is being made or shown; close it first")
         return folder
 
-    def preview(self, name: str) -> Path | None:
-        """A picture of a scene of the list: what its page showed last, else its first photograph."""
+    def preview(self, name: str) -> bytes | None:
+        """A small picture of a scene of the list, as WebP; None where there is none. As those that are dropped,
+        photographs are decoded by a process of its own.
+        """
+        from ..datamanagers.images import load_preview
+        from ..io.images import encode  # imports OpenCV
+
+        path = self.preview_file(name)
+        if path is None:
+            return None
+        key = (path, path.stat().st_mtime_ns)
+        with self._preview_lock:
+            if key not in self._pictures:
+                if self._decoder is None:
+                    self._decoder = Uploads()
+                try:
+                    png = self._decoder.store(path.read_bytes())
+                    self._pictures[key] = encode(load_preview(png, _PREVIEW_PIXELS), "webp")
+                    png.unlink()
+                except DataError:  # training says what is wrong with it
+                    self._pictures[key] = b""
+            return self._pictures[key] or None
+
+    def preview_file(self, name: str) -> Path | None:
+        """The file of a scene's picture: what its page showed last, else its first photograph."""
         root = self._previews.get(name)
         if root is None:
             return None

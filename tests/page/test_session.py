@@ -311,6 +311,14 @@ def test_a_style_is_saved_and_taken_up_again(session: Session, world: World, lis
     session.handle(1, messages.Set(name="luminance", value=0.5))
     session.take_style(alone)
     assert session.state.look == found and len(session.state.shelf) == 2, "its photographs are on the shelf"
+    # No path of this machine: photographs lie beside the file.
+    document = json.loads(alone)
+    document["style"]["references"] = [str(world.references[0])]
+    document["style"]["weights"] = []
+    document["style"]["pin"] = []
+    document["sha256"] = {}
+    with pytest.raises(DataError, match="is not here"):
+        session.take_style(json.dumps(document).encode())
     for wrong in (b"PK\3\4 no archive", b"{}", b"\xff"):
         with pytest.raises(FprfError):
             session.take_style(wrong)

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from session_helpers import until
 
@@ -228,10 +230,13 @@ def test_scenes_that_are_trained_come_first(page: Shown, tmp_path: Path) -> None
     assert len(recent) == 12 and (recent[0]["name"], recent[0]["kind"]) == ("yard", "trained")
     (run.parent / "files").mkdir()
     shutil.copyfile(EXAMPLES["night.jpg"], run.parent / "files" / "a.jpg")
-    assert page.state() and page.preview("yard") == run.parent / "files" / "a.jpg"
+    assert page.state() and page.preview_file("yard") == run.parent / "files" / "a.jpg"
+    picture = page.preview("yard")
+    assert picture is not None and cv2.imdecode(np.frombuffer(picture, np.uint8), 1).shape[1] == 320
     (run / "page").mkdir()
-    (run / "page" / "preview.png").touch()
-    assert page.preview("yard") == run / "page" / "preview.png"
+    (run / "page" / "preview.png").write_bytes(b"no picture")
+    assert page.preview("yard") is None
+    assert page.preview_file("yard") == run / "page" / "preview.png"
 
 
 DEAF = f"""#!{sys.executable}
