@@ -265,7 +265,8 @@ def test_what_is_made_is_kept_and_a_lost_viewer_is_said(world: World, tmp_path: 
             assert len(page.evaluate("() => fprf.live.state.keys")) == 1
             page.wait_for_function("() => fprf.place.splats.styles.has('dusk')")
             page.locator("#said .wait").wait_for(state="detached")
-            # What is shown is what is saved.
+            page.wait_for_function("() => fprf.stage.styles.some((style) => style.name === 'Now')")
+        # What is shown is what is saved.
             page.evaluate("() => fprf.stage.choose('Captured')")
             with page.expect_download(timeout=120_000) as downloaded:
                 page.locator("#save-ply").click()
