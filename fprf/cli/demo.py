@@ -120,7 +120,6 @@ def run(args: list[str]) -> int:
             facts={
                 "Photographs": len(scene.names),
                 "Size": f"{width} × {height}",
-                "3D Gaussians": len(scene.gaussians),
                 "Trained for": f"{opened.seconds:.0f} s",
                 "Unseen views": f"{metrics['psnr']:.1f} dB",
                 "A new style": f"{metrics['new_style_seconds']:.1f} s",

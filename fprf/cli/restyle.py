@@ -582,7 +582,7 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     """Write the page: views as they are and in each style, evenly taken from the nearer half."""
     from ..datamanagers.images import load_preview
     from ..io.images import to_uint8
-    from ..page.writer import REFERENCE_PIXELS, Page, PageView, Reference, Style, write_page
+    from ..page.writer import REFERENCE_PIXELS, Page, PageView, Reference, Style, shown_of, write_page
 
     # Views lie on rings around the scene or within it, the nearer ones first: from these the things can be
     # told.
@@ -604,7 +604,6 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     page = Page(
         title=stem_of(config.captures[0]) or "capture",
         facts={
-            "Gaussians": len(scene.gaussians),
             "Regions": len(scene.measured()[0].share),
             "Styles": len(styles),
         },
@@ -617,4 +616,9 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
         scene=scene,
         start=views[0],
     )
-    write_page(path, page, megabytes=config.megabytes)
+    count = write_page(path, page, megabytes=config.megabytes)
+    if count < len(scene.gaussians):
+        shown = shown_of(count, len(scene.gaussians))
+        print(
+            f"{path}: {shown} Gaussians, those that show most; --megabytes above {config.megabytes:g} leaves fewer out"
+        )

@@ -104,7 +104,7 @@ class Page:
     title: str
     lead: str = ""
     facts: Mapping[str, str | int]
-    """A few, by their labels ("Photographs": 34)."""
+    """A few, by their labels ("Photographs": 34); the page adds how many Gaussians it shows."""
     views: Sequence[PageView]
     """At least one."""
     styles: Sequence[Style]
@@ -136,6 +136,13 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
         write_image(preview_of(path), shrink(picture, _CHAT_PICTURE_PIXELS))
     write_text(path, text)
     return count
+
+
+def shown_of(shown: int, captured: int) -> str:
+    """How many Gaussians a page shows, in words."""
+    if shown == captured:
+        return f"{shown:,}"
+    return f"{shown:,} of {captured:,}"
 
 
 def page_html(
@@ -333,8 +340,12 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
         ("Views", _views(page.views) if any(view.photograph is not None for view in page.views) else ""),
         ("Styles", blocks),
     ]
-    facts = ((name, fact if isinstance(fact, str) else f"{fact:,}") for name, fact in page.facts.items())
-    rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts)
+    facts = {name: fact if isinstance(fact, str) else f"{fact:,}" for name, fact in page.facts.items()}
+    if page.scene is not None and head is not None:
+        facts["3D Gaussians"] = shown_of(int(head["count"]), len(page.scene.gaussians))
+    rows = "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(fact)}</dd></div>" for name, fact in facts.items()
+    )
     present = []
     for name, part in below:
         if part:

@@ -426,3 +426,25 @@ def test_a_headset_gets_a_picture_for_either_eye(browser: Any, tmp_path: Path) -
     page.evaluate("() => session.dispatchEvent(new Event('end'))")
     assert page.evaluate("() => fprf.place.lost") is False
     assert page.errors == []
+
+
+def test_a_moving_camera_draws_fewer_gaussians_where_all_take_too_long(page: Any) -> None:
+    pixels(page)
+    assert page.evaluate("() => [fprf.place.splats.every, fprf.place.splats.kept]") == [1, 2000]
+    page.evaluate("() => { fprf.place.fewer = 2; fprf.place.touch(); }")
+    page.wait_for_function("() => fprf.place.splats.every === 4 && fprf.place.splats.kept === 500")
+    plain = pixels(page)
+    assert page.evaluate("() => [fprf.place.splats.every, fprf.place.splats.kept]") == [1, 2000], (
+        "all at rest"
+    )
+    page.evaluate("() => fprf.place.splats.sort(fprf.place.camera.view, fprf.place.scene.near, 4)")
+    fewer = page.evaluate("() => { fprf.place.paint(); return fprf.place.canvas.toDataURL('image/png'); }")
+    page.evaluate("() => { fprf.place.fewer = 0; fprf.place.touch(); }")
+    assert np.abs(pixels(page) - plain).max() == 0
+    coarse = cv2.imdecode(np.frombuffer(base64.b64decode(fewer.split(",")[1]), np.uint8), 1) / 255
+    middle = np.s_[150:250, 250:390]
+    assert np.abs(coarse[middle].mean((0, 1)) - plain[middle].mean((0, 1))).max() < 0.15, "as much is covered"
+    page.evaluate("() => { fprf.place.spare(500, 0.25); fprf.place.spare(500, 0.25); }")
+    assert page.evaluate("() => fprf.place.fewer") == 2
+    page.evaluate("() => fprf.place.spare(5, 1)")
+    assert page.evaluate("() => fprf.place.fewer") == 1

@@ -227,3 +227,11 @@ def test_chats_find_a_title_and_a_picture_where_the_page_has_an_address(tmp_path
     assert cv2.imread(str(tmp_path / "ball.jpg")).shape[2] == 3
     assert "og:image" not in written(tmp_path / "plain.html", seen(ball(50))).read_text()
     assert not (tmp_path / "plain.jpg").exists()
+
+
+def test_a_page_says_how_many_of_the_gaussians_it_holds(tmp_path: Path) -> None:
+    scene = seen(ball(3000, 1))
+    whole = page_html(page_of(scene))[0]
+    assert "<dt>3D Gaussians</dt><dd>3,000</dd>" in whole
+    text, count = page_html(page_of(scene), megabytes=0.9 * len(whole.encode()) / 2**20)
+    assert f"<dt>3D Gaussians</dt><dd>{count:,} of 3,000</dd>" in text and count < 3000

@@ -6,6 +6,8 @@ const SHARES = [1, 0.75, 0.5, 0.35, 0.25];
 const TURN_SPEED = 0.12; // radians a second of a scene that turns by itself; by eye
 const SWING = 0.3; // radians to either side where it is not turned all the way round; by eye
 const AROUND_SHARE = 0.5; // length of the mean direction of cameras, below which they stand around something; by eye
+const FEWER = [1, 2, 4, 8]; // of so many neighbouring Gaussians one is drawn while the camera moves
+const MOST_MOVING = { software: 200_000, card: 2_000_000 }; // Gaussians of a moving camera to begin with; by eye
 const EDGE = 4096; // pixels a side of the canvas, at most
 const CLICK_MS = 280; // until a click is known not to be the first half of a double click; by eye
 
@@ -98,6 +100,8 @@ class Place {
         this.listeners.lost?.(false);
       });
     }
+    const most = splats?.software ? MOST_MOVING.software : MOST_MOVING.card, first = FEWER.findIndex((every) => (splats?.count ?? 0) / every <= most);
+    this.fewer = first < 0 ? FEWER.length - 1 : first;
     Object.assign(this, { zoom: 1, speed: 1, orbiting: false });
     this.fading = true; // what no photograph saw, into the background
     this.readSky();
@@ -164,12 +168,13 @@ class Place {
     this.flight?.(now);
     if (this.painter) { this.painter(this); return; }
     if (this.lost || !this.look.first || !this.splats.styles.has(this.look.first) || this.waiting) return;
-    if (this.moved && !this.sorting) {
+    const still = now - this.still > REST, every = still ? 1 : FEWER[this.fewer];
+    if (!this.sorting && (this.moved || (still && this.splats.every !== 1))) {
       this.moved = false;
       this.sorting = true;
-      this.splats.sort(this.camera.view, this.scene.near).then(() => { this.sorting = false; this.changed = true; });
+      this.splats.sort(this.camera.view, this.scene.near, every).then(() => { this.sorting = false; this.changed = true; });
     }
-    const rest = now - this.still > REST && !this.sorting && !this.moved;
+    const rest = still && !this.sorting && !this.moved;
     if (!this.splats.kept || !(this.changed || (rest && !this.exact))) return;
     const share = rest || !this.full ? 1 : SHARES.find((each) => each * each * this.full <= FRAME) ?? SHARES.at(-1);
     this.changed = false;
@@ -177,10 +182,17 @@ class Place {
     const start = performance.now();
     this.paint({ share, exact: rest });
     this.wait(() => {
+      if (!rest) this.spare(performance.now() - start, share);
       if (!rest) this.full = 0.5 * (this.full || (performance.now() - start) / share ** 2) + 0.5 * (performance.now() - start) / share ** 2;
       this.milliseconds = performance.now() - start;
       this.listeners.drawn?.(rest);
     });
+  }
+
+  // Draw fewer Gaussians of a moving camera where the fewest pixels take too long, and more where there is time.
+  spare(milliseconds, share) {
+    if (milliseconds > 2 * FRAME && share === SHARES.at(-1)) this.fewer = Math.min(this.fewer + 1, FEWER.length - 1);
+    else if (milliseconds < FRAME / 3 && share === 1) this.fewer = Math.max(this.fewer - 1, 0);
   }
 
   // Draw what is to be seen into the canvas, over the page's own background.

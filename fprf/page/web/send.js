@@ -147,7 +147,7 @@ class Headset {
     const { place } = this, { splats, scene } = place;
     if (!this.sorting) {
       this.sorting = true;
-      splats.sort(this.view(pose.transform, start), scene.near).then(() => { this.sorting = false; });
+      splats.sort(this.view(pose.transform, start), scene.near, FEWER[place.fewer]).then(() => { this.sorting = false; });
     }
     if (!splats.kept) return;
     for (const eye of pose.views) {

@@ -24,7 +24,7 @@ uniform sampler2D first, second;        // a texel a Gaussian: mean colour, numb
 uniform sampler2D maps0, maps1;         // three texels a map
 uniform mat4 range0, range1;            // columns 0 and 1: least colour and width
 uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform float near, blend, wipe, largest; uniform vec3 eye;
-uniform int bands; uniform bool depth; uniform bool sharp;
+uniform int bands; uniform bool depth; uniform bool sharp; uniform float wider;
 layout(location = 0) in uint index;
 flat out uvec4 place; // bits of the floats: centre in the picture, longer half axis at one standard deviation
 flat out uvec4 look;  // half floats: colour, opacity; shorter half axis over the longer, how many deviations the quad reaches; depth
@@ -47,7 +47,7 @@ void main() {
   vec3 mean = mix(a.xyz, vec3(a.w, b.xy), vec3(w.x & 65535u, w.x >> 16u, w.y & 65535u) / 65535.);
   vec3 p = (view * vec4(mean, 1.)).xyz; // x right, y down, z forward
   if (p.z <= near) return;
-  vec3 scale = exp(mix(vec3(b.zw, c.x), c.yzw, vec3(w.w & 255u, (w.w >> 8u) & 255u, (w.w >> 16u) & 255u) / 255.));
+  vec3 scale = wider * exp(mix(vec3(b.zw, c.x), c.yzw, vec3(w.w & 255u, (w.w >> 8u) & 255u, (w.w >> 16u) & 255u) / 255.));
   vec3 three = (vec3(w.z & 1023u, (w.z >> 10u) & 1023u, (w.z >> 20u) & 1023u) / 1023. * 2. - 1.) * .70710678;
   float four = sqrt(max(0., 1. - dot(three, three)));
   uint out4 = w.z >> 30u; // component left out: w x y z
@@ -165,9 +165,9 @@ function sorter() {
       depth = new Float32Array(count); bits = new Int32Array(depth.buffer); key = new Uint16Array(count);
       return;
     }
-    const [a, b, c, d] = data.row, count = depth.length, near = data.near, start = performance.now();
+    const [a, b, c, d] = data.row, count = depth.length, { near, every } = data, start = performance.now();
     let least = 0x7fffffff, most = 0, kept = 0;
-    for (let i = 0, j = 0; i < count; i++, j += 3) {
+    for (let i = 0, j = 0; i < count; i += every, j += 3 * every) {
       const z = a * means[j] + b * means[j + 1] + c * means[j + 2] + d;
       depth[i] = z;
       if (z > near) {
@@ -178,7 +178,7 @@ function sorter() {
       }
     }
     const scale = 65535 / Math.max(1, most - least), starts = new Uint32Array(65537);
-    for (let i = 0; i < count; i++) {
+    for (let i = 0; i < count; i += every) {
       if (!(depth[i] > near)) continue;
       const k = (bits[i] - least) * scale | 0;
       key[i] = k;
@@ -186,7 +186,7 @@ function sorter() {
     }
     for (let k = 0; k < 65536; k++) starts[k + 1] += starts[k];
     order = data.spare && data.spare.length >= kept ? data.spare : new Uint32Array(count);
-    for (let i = 0; i < count; i++) if (depth[i] > near) order[starts[key[i]]++] = i;
+    for (let i = 0; i < count; i += every) if (depth[i] > near) order[starts[key[i]]++] = i;
     postMessage({ order, kept, milliseconds: performance.now() - start }, [order.buffer]);
   };
 }
@@ -219,7 +219,7 @@ class Splats {
     this.colours.clear();
     this.worker?.terminate();
     this.sorted?.(); // a sort that was under way is never answered
-    Object.assign(this, { head, count: head.count, order: null, kept: 0, sortMilliseconds: 0 });
+    Object.assign(this, { head, count: head.count, order: null, kept: 0, every: 1, sortMilliseconds: 0 });
     this.source = { shape, chunks, palette }; // to come back from a lost context
     this.worker = new Worker(URL.createObjectURL(new Blob([`"use strict";(${sorter})()`], { type: "text/javascript" })));
     const means = decodedMeans(shape, chunks, head.count);
@@ -334,20 +334,22 @@ class Splats {
     });
   }
 
-  // Order the Gaussians for a camera; `view` is world to camera by columns. One at a time.
-  sort(view, near) {
+  // Order the Gaussians for a camera; `view` is world to camera by columns. One at a time. Of `every` so many neighbours one is
+  // drawn, as much larger: they lie in Morton order.
+  sort(view, near, every = 1) {
     return new Promise((done) => {
       this.sorted = done;
       this.worker.onmessage = ({ data }) => {
         this.order = data.order;
         this.kept = data.kept;
+        this.every = every;
         this.sortMilliseconds = data.milliseconds;
         this.put();
         done();
       };
       const spare = this.order;
       this.order = null;
-      this.worker.postMessage({ row: [view[2], view[6], view[10], view[14]], near, spare }, spare ? [spare.buffer] : []);
+      this.worker.postMessage({ row: [view[2], view[6], view[10], view[14]], near, every, spare }, spare ? [spare.buffer] : []);
     });
   }
 
@@ -447,6 +449,7 @@ class Splats {
     gl.uniform1f(places.near, near);
     gl.uniform1f(places.blend, look.blend ?? 0);
     gl.uniform1f(places.wipe, look.wipe ?? -1);
+    gl.uniform1f(places.wider, Math.sqrt(this.every)); // as much area as all of them
     gl.uniform1f(places.largest, this.head.largest);
     gl.uniform1i(places.bands, Math.round(Math.sqrt(this.head.harmonics)));
     gl.uniform1i(places.depth, pixel ? 1 : 0);
