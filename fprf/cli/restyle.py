@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _MAX_PAGE_VIEWS = 4
 """Views on the page: by eye, they stand in one row."""
+_PAGE_BACKGROUND = (0.85, 0.845, 0.83)
+"""Behind an object in pictures of the page: as behind it on the stage, in the light theme; by eye."""
 _RESTYLE_HELP = f"""Restyle finished captures of 3D Gaussians with photographs; their own photographs and cameras are not
 needed.
 
@@ -590,10 +592,14 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     most = min(_MAX_PAGE_VIEWS, nearer)
     views = sorted({round((k + 0.5) * nearer / most - 0.5) for k in range(most)})
     cameras = scene.cameras.scaled(0.5)
+    scene = replace(scene, background=_PAGE_BACKGROUND)
+    shown = [replace(each.scene, background=_PAGE_BACKGROUND) for each in made]
     before = []
     for view in views:
         before.append(to_uint8(scene.render(cameras, view).rgb))
-    after = [[to_uint8(each.scene.render(cameras, view).rgb) for view in views] for each in made]
+    after = []
+    for styled in shown:
+        after.append([to_uint8(styled.render(cameras, view).rgb) for view in views])
     names = labels(config.references)
     styles = []
     for k, (each, pictures) in enumerate(zip(made, after, strict=True)):
@@ -618,7 +624,7 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     )
     count = write_page(path, page, megabytes=config.megabytes)
     if count < len(scene.gaussians):
-        shown = shown_of(count, len(scene.gaussians))
+        held = shown_of(count, len(scene.gaussians))
         print(
-            f"{path}: {shown} Gaussians, those that show most; --megabytes above {config.megabytes:g} leaves fewer out"
+            f"{path}: {held} Gaussians, those that show most; --megabytes above {config.megabytes:g} leaves fewer out"
         )
