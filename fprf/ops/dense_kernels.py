@@ -148,7 +148,9 @@ def network(x, inputs, weights, biases, widths, side, row, out, outputs):
 # In training every layer is kept. Its three products are one layer forward, the same with the weights as they
 # are for the gradient of its inputs, and `outer` for that of its weights.
 OUTER_ROWS = 4
-"""Outputs of a tile of `outer`: with 4 vectors of inputs 16 sums, which do not wait for each other."""
+"""Outputs of a tile of `outer`."""
+_OUTER_COLUMNS = 4 if WIDE == 16 else 2
+"""Vectors of inputs of a tile: 16 sums of 32 registers, or 8 of 16."""
 _OUTER_POINTS = 128
 """Points that all tiles take before the next ones: they and their gradients lie in the caches; by eye."""
 
@@ -238,8 +240,8 @@ def outer(g, outputs, x, inputs, slices, out):
             steps = (outputs, inputs)
             for o in range(0, outputs, OUTER_ROWS):
                 at = (part * outputs + o) * inputs
-                for i in range(0, inputs, 4 * WIDE):
-                    columns = min(4, (inputs - i) // WIDE)
+                for i in range(0, inputs, _OUTER_COLUMNS * WIDE):
+                    columns = min(_OUTER_COLUMNS, (inputs - i) // WIDE)
                     firsts = (first * outputs + o, first * inputs + i, at + i)
                     if columns == 4:
                         add_outer(g, x, out, firsts, steps, points, 4)
