@@ -266,7 +266,7 @@ def test_what_is_made_is_kept_and_a_lost_viewer_is_said(world: World, tmp_path: 
             page.wait_for_function("() => fprf.place.splats.styles.has('dusk')")
             page.locator("#said .wait").wait_for(state="detached")
             page.wait_for_function("() => fprf.stage.styles.some((style) => style.name === 'Now')")
-        # What is shown is what is saved.
+            # What is shown is what is saved.
             page.evaluate("() => fprf.stage.choose('Captured')")
             with page.expect_download(timeout=120_000) as downloaded:
                 page.locator("#save-ply").click()
