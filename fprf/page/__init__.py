@@ -1,9 +1,9 @@
 """The page that shows a scene in 3D: one file (`fprf restyle --page`), or served with a scene behind it
 (`fprf view`).
 
-- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `send.js` has links and headsets, `page.js` the controls: every page has
-  these, `stage.html` and `page.css`; `page.html` is the file that one sends; `live.*`, `panel.*`, `field.js`,
-  `photographs.js`, `start.js` are the served page).
+- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `send.js` has links and headsets, `page.js`
+  the controls: every page has these, `stage.html` and `page.css`; `page.html` is the file that one sends;
+  `live.*`, `panel.*`, `field.js`, `photographs.js`, `start.js` are the served page).
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
 - Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`,
   `start.py`.
