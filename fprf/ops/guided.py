@@ -241,12 +241,12 @@ def _axis(pixels: int, cells: int, radius: int, stride: int, fineness: float) ->
 
     # Windows around the centres as shares of the axis, in nodes and in centres; then the least-squares fit of
     # the cells.
-    hat = _interpolation(nodes, pixels)
+    hat = interpolation(nodes, pixels)
     middle = (torch.arange(centres).double() + 0.5) / centres
     reach = 0.5 * size / pixels
     window = _overlap(middle - reach, middle + reach, nodes)
     box = _overlap(middle - reach, middle + reach, centres)
-    read = _interpolation(stored, centres)
+    read = interpolation(stored, centres)
     fit = torch.linalg.solve(read @ read.T, read)
     return _Axis(
         hat=hat,
@@ -255,7 +255,7 @@ def _axis(pixels: int, cells: int, radius: int, stride: int, fineness: float) ->
     )
 
 
-def _interpolation(cells: int, pixels: int) -> Annotated[Tensor, "cells pixels"]:
+def interpolation(cells: int, pixels: int) -> Annotated[Tensor, "cells pixels"]:
     """Weight of each cell at each pixel: bilinear interpolation as `F.interpolate` with align_corners=False
     does it.
     """

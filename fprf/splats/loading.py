@@ -26,7 +26,7 @@ from .learner import Bounds, GaussianLearner, Stage, refined
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import load_photographs, make_levels
 from .scene import SplatScene, with_illumination
-from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors
+from .semantics import SEMANTICS_VERSION, Semantics, find_semantics, load_semantics, semantics_tensors
 from .view_corrections import ViewCorrections
 
 _FIT_POSES_RATE = 2e-3
@@ -95,7 +95,12 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         """Semantics from the run folder; found anew, and kept, where those are of another step, encoder or
         setting.
         """
-        wanted = {"step": saved.step, "regions": config.regions, "semantic_size": config.semantic_size}
+        wanted = {
+            "step": saved.step,
+            "regions": config.regions,
+            "semantic_size": config.semantic_size,
+            "version": SEMANTICS_VERSION,
+        }
         if not training and (root / "style.safetensors").is_file():
             tensors = run.load_tensors("style")
             if {name: int(tensors.pop(name, torch.tensor(-1))) for name in wanted} == wanted:
