@@ -59,13 +59,13 @@ def cell_maps(
     target = _window_mean(value, reach).permute(1, 2, 0)
     square = _window_mean((colour[:, None] * colour).flatten(0, 1), reach).permute(1, 2, 0)
     product = _window_mean((colour[:, None] * value).flatten(0, 1), reach).permute(1, 2, 0)
-    spread = square.unflatten(2, (3, 3)) - mean[..., :, None] * mean[..., None, :]
-    shared = product.unflatten(2, (3, -1)) - mean[..., :, None] * target[..., None, :]
+    spread = square.reshape(*cells, 3, 3) - mean[..., :, None] * mean[..., None, :]
+    shared = product.reshape(*cells, 3, -1) - mean[..., :, None] * target[..., None, :]
     slope = torch.linalg.solve(spread + eps * torch.eye(3).to(spread), shared)
     offset = target - (mean[..., None] * slope).sum(2)
-    maps = torch.cat([slope, offset[:, :, None]], 2)
+    maps: Tensor = torch.cat([slope, offset[:, :, None]], 2)
     # The mean over all windows that a cell lies in.
-    maps = _window_mean(maps.flatten(2).permute(2, 0, 1), reach).permute(1, 2, 0).unflatten(2, (4, -1))
+    maps = _window_mean(maps.flatten(2).permute(2, 0, 1), reach).permute(1, 2, 0).reshape(*cells, 4, -1)
     maps[:, :, 3] += middle[:, 0, 0] - (grey[:, 0, 0, None] * maps[:, :, :3]).sum(2)
     return maps.to(device=features.device, dtype=torch.float32)
 
@@ -83,7 +83,7 @@ def apply_cell_maps(
     result = maps.new_empty(height, width, channels)
     for start in range(0, height, _ROWS):
         some = slice(start, start + _ROWS)
-        dense = (across @ strips[some]).unflatten(2, (4, channels))
+        dense = (across @ strips[some]).view(-1, width, 4, channels)
         part = dense[:, :, 3].clone()
         for axis in range(3):
             part.addcmul_(dense[:, :, axis], guide[some, :, axis, None].to(part))

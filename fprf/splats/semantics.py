@@ -55,7 +55,7 @@ _WINDOW_REACH = 1
 right."""
 _MIN_CELL_VARIANCE = 1e-4
 """Variance of the colours of cells, below which they hardly explain features: a fiftieth of a channel's range.
-With ten times as much fewer pixels at borders match right, with a tenth fewer inside."""
+With ten times as much fewer pixels at borders match right."""
 _SPREAD_COMPONENTS = 8
 """Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
 _NEIGHBOURHOOD_PIXELS = 1.0
