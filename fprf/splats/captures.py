@@ -48,7 +48,7 @@ SAMPLE = 2_000_000
 """Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at
 hand.
 """
-_CACHE_VERSION = 12
+_CACHE_VERSION = 13
 """Of what is found out about a capture: it counts up whenever the same file gives something else."""
 _MAX_CACHED_CAPTURES = 24
 """Captures of which the cache keeps what was found out, some MB each."""
