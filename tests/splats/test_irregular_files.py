@@ -260,8 +260,9 @@ def test_stray_gaussians_decide_neither_views_nor_semantics() -> None:
     )
     away = [each.views.pose[:, :, 3].norm(dim=1) for each in (first, second)]
     assert torch.allclose(away[0].mean(), away[1].mean(), rtol=0.05)
-    features = [each.found().style.share for each in (first, second)]
-    assert torch.allclose(features[0], features[1], atol=0.1)
+    # Regions are numbered as they come.
+    shares = [each.found().style.share.sort().values for each in (first, second)]
+    assert torch.allclose(shares[0], shares[1], atol=0.1)
 
 
 ENDINGS = {"ply": 1e-6, "splat": 1e-6, "spz": 2e-6, "sog": 1e-4, "compressed.ply": 2e-3}
