@@ -68,6 +68,11 @@ BENCHMARKS = {
         "--folder {town}/images --lights 1 --seeds 0 --width 64",
         "folders of pictures of fixed cameras; without them it is skipped",
     ),
+    "sun": Benchmark(
+        "a town captured under clouds, lit by nine suns, against its tracer",
+        "--run {run} --suns 1 --views 1",
+        "a run of Gaussians of a town in the palette overcast",
+    ),
     "mutants": Benchmark(
         "how many small mistakes in the mathematics the tests notice",
         "--only fprf/rendering/splines.py --sample 2",

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from fprf.errors import DataError
 
 from .layout import build_town
-from .palettes import PALETTES, Palette
+from .palettes import OTHERS, PALETTES, Palette
 from .palettes import palette as palette_of
 from .render import Picture, View, directions, is_test, render, walk
 from .surface import CLASSES
@@ -230,7 +230,7 @@ def main(argv: list[str]) -> int:
     )
     parser.add_argument("folder", type=Path, help="empty or new")
     parser.add_argument("--seed", type=int, default=0, help="decides where houses, trees and cars stand")
-    parser.add_argument("--palette", default="day", choices=sorted(PALETTES), help="light and colours")
+    parser.add_argument("--palette", default="day", choices=sorted({**PALETTES, **OTHERS}), help="light and colours")
     parser.add_argument("--views", type=int, default=40, help="number of images")
     parser.add_argument("--width", type=int, default=160, help="pixels across an image")
     parser.add_argument("--height", type=int, default=120, help="pixels down an image")
