@@ -70,8 +70,8 @@ BENCHMARKS = {
     ),
     "sun": Benchmark(
         "a town captured under clouds, lit by nine suns, against its tracer",
-        "--run {run} --suns 1 --views 1",
-        "a run of Gaussians of a town in the palette overcast",
+        "--steps 60 --pictures 16 --suns 1 --views 1",
+        "a run of Gaussians of a town in the palette overcast; without one it trains it first",
     ),
     "mutants": Benchmark(
         "how many small mistakes in the mathematics the tests notice",

@@ -1,8 +1,8 @@
 """A town that was captured under clouds, lit by suns, against what its own tracer shows of them.
 
-    python -m benchmarks town TOWN --palette overcast --views 60 --width 320 --height 240
-    python -m fprf train fprf-splats --data TOWN --output RUN --minutes 3
-    python -m benchmarks sun --run RUN [--suns 9] [--views 8] [--output JSON]
+    python -m benchmarks sun [--run RUN] [--steps 10000] [--suns 9] [--views 8] [--output JSON]
+
+RUN are Gaussians of a town in the palette overcast; without one they are trained first, on 60 views of 320 x 240.
 
 The light is given: sun and sky of the palette `day`, at nine places of the sun. Judged are held-out views, but for
 the sky, each row after the best factor a channel in linear light over all views, as the first row has it alone.
@@ -10,6 +10,7 @@ Shadows are judged where the tracer says that a surface which is no foliage face
 """
 
 import math
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fprf.checks import at_least
-from fprf.cli.parsing import parse
+from fprf.cli.parsing import load_method, parse
 from fprf.errors import UsageError
 from fprf.light.relight import Received, encoded, gains, linear
 from fprf.light.sky import Light
@@ -31,6 +32,7 @@ from fprf.splats.drawing import draw
 from fprf.splats.pinholes import covering
 from fprf.splats.relighting import Illumination, find_illumination, relit_harmonics
 from fprf.splats.scene import SplatScene
+from fprf.training.driver import train
 from fprf.training.loading import open_run
 
 from .common import report
@@ -40,6 +42,7 @@ from .town.render import View, cast, directions, geometry, is_test, render, shad
 from .town.shapes import Material
 from .town.surface import FOLIAGE, SKY
 from .town.truth import town_settings
+from .town.write import write_town
 
 _SUNS = tuple((azimuth, elevation) for elevation in (15.0, 30.0, 50.0) for azimuth in (232.0, 60.0, 140.0))
 """Azimuth and elevation in degrees, as palettes have them."""
@@ -51,8 +54,12 @@ _MIN_FACING = 0.05
 class SunBenchConfig:
     """A town under clouds, lit."""
 
-    run: Path = Path()
-    """Run of Gaussians of a town in the palette overcast."""
+    run: Path | None = None
+    """Run of Gaussians of a town in the palette overcast; none = one that is trained, and thrown away."""
+    steps: int = 10_000
+    """Steps that it is trained."""
+    pictures: int = 60
+    """Views that it is trained on, less every eighth."""
     suns: int = 9
     """Suns of nine: three azimuths at 15 degrees, then at 30 and at 50."""
     views: int = 8
@@ -61,6 +68,8 @@ class SunBenchConfig:
     """JSON file for the figures; none = only the table."""
 
     def __post_init__(self) -> None:
+        at_least("steps", self.steps, 1)
+        at_least("pictures", self.pictures, 8)
         at_least("suns", self.suns, 1)
         at_least("views", self.views, 1)
 
@@ -80,7 +89,23 @@ class _Judged(NamedTuple):
 def main(argv: list[str]) -> int:
     """`python -m benchmarks sun`."""
     config = parse(SunBenchConfig(), argv, prog="python -m benchmarks sun", description=__doc__ or "")
-    loaded = open_run(config.run, device="cpu")
+    with tempfile.TemporaryDirectory(prefix="fprf-sun-") as made:
+        figures = _figures(config, config.run or _trained(config, Path(made)))
+    report(config.output, figures)
+    return 0
+
+
+def _trained(config: SunBenchConfig, folder: Path) -> Path:
+    """Gaussians of a town under clouds."""
+    write_town(folder / "town", seed=0, palette="overcast", views=config.pictures, width=320, height=240)
+    method, name = load_method("fprf-splats")
+    method = replace(method, data=folder / "town", output=folder / "run", steps=config.steps)
+    return train(method, name)
+
+
+def _figures(config: SunBenchConfig, run: Path) -> dict[str, object]:
+    """A row for each sun, and their mean."""
+    loaded = open_run(run, device="cpu")
     scene = loaded.scene
     if not isinstance(scene, SplatScene):
         raise UsageError("--run: no run of Gaussians of a town; see python -m benchmarks sun --help")
@@ -104,16 +129,13 @@ def main(argv: list[str]) -> int:
             {"azimuth": azimuth, "elevation": elevation} | _rows(scene, known, judged, town, look, truth)
         )
         print("  ".join(f"{name} {value:.2f}" for name, value in rows[-1].items()), flush=True)
-    figures = {
-        "run": config.run.name,
+    return {
         "gaussians": len(scene.gaussians),
         "views": len(views),
         "found_seconds": round(found, 2),
         "suns": rows,
         "mean": {name: float(np.mean([row[name] for row in rows])) for name in rows[0]},
     }
-    report(config.output, figures)
-    return 0
 
 
 def _judged(town: Town, views: Sequence[View], cameras: Sequence[Pinhole]) -> _Judged:

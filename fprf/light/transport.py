@@ -1,6 +1,6 @@
 """Light that reaches points through 3D Gaussians along one direction.
 
-N Gaussians take light away, M points receive it, K rays lead to each. A ray meets a Gaussian most where it
+N Gaussians take light away, M points receive it. A ray meets a Gaussian most where it
 comes nearest to its mean, by the Gaussian's own measure; there it takes away
 
     alpha = opacity exp(-d^2 / 2),      T = product over the Gaussians above the point of (1 - alpha),
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..ops.threads import on_threads
-from ..ops.transport_kernels import COLUMNS, Lists, Receivers, Widths, count, fill, project, reach
+from ..ops.transport_kernels import COLUMNS, Lists, Receivers, count, fill, project, reach
 
 _MAX_COLUMNS = 256
 """Cells of the grid across the light, a side, at most: more lists than that take longer to write than to read."""
@@ -70,39 +70,33 @@ def frame_of(
 @torch.inference_mode()
 def transport(
     blockers: Blockers,
-    points: Annotated[Tensor, "M K 3"],
+    points: Annotated[Tensor, "M 3"],
     frame: Annotated[Tensor, "3 3"],
     offset: Annotated[Tensor, "M"],
     soft: Annotated[Tensor, "M"],
-    slopes: Annotated[Tensor, "K 2"] | None = None,
     blur: float = 0.0,
 ) -> Annotated[Tensor, "M"]:
-    """Share of light in [0, 1] that reaches points, the mean over their K rays.
+    """Share of light in [0, 1] that reaches points.
 
     `frame` is that of `frame_of`. A Gaussian counts where a ray meets it more than `offset` above the point,
-    and fully from `offset` + `soft` on. `slopes` are those of the rays against the light, in its frame.
+    and fully from `offset` + `soft` on. Gaussians are widened
+    across the light by a deviation of `blur`.
     """
-    rays = points.shape[1]
-    if slopes is None:
-        slopes = torch.zeros(rays, 2)
     # Into the frame of the light, about the middle, where float32 is fine.
-    middle = blockers.means.mean(0) if len(blockers.means) else points.mean((0, 1))
+    middle = blockers.means.mean(0) if len(blockers.means) else points.mean(0)
     turn = frame.float().numpy()
     place = ((points - middle) @ frame.float().T).contiguous().numpy()
     means = (blockers.means - middle).contiguous().numpy()
     rows = np.empty((len(means), COLUMNS), np.float32)
-    spread = float(slopes.norm(dim=1).max())
-    floor = float(place[..., 2].min()) if len(place) else 0.0
     gaussians = (means, blockers.covariances.contiguous().numpy(), blockers.opacities.contiguous().numpy())
-    widths = Widths(np.float32(blur**2), np.float32(spread), np.float32(floor))
-    on_threads(project, gaussians, np.ascontiguousarray(turn), widths, rows)
+    on_threads(project, gaussians, np.ascontiguousarray(turn), np.float32(blur**2), rows)
     rows = rows[rows[:, 10] >= 0]
     rows = rows[np.argsort(-rows[:, 9], kind="stable")]
     # Lines of the grid lie where the points are: the same number between any two of them.
     columns = int(min(_MAX_COLUMNS, max(1, math.sqrt(len(rows) / _GAUSSIANS_PER_CELL))))
     lines = []
     for axis in range(2):
-        some = place[:: max(1, len(place) // 20_000), 0, axis]
+        some = place[:: max(1, len(place) // 20_000), axis]
         lines.append(np.quantile(some, np.linspace(0, 1, columns + 1)[1:-1]).astype(np.float32))
     ranges = np.empty((len(rows), 4), np.int32)
     for axis in range(2):
@@ -114,18 +108,30 @@ def transport(
     fill(ranges, columns, starts[:-1].copy(), ids)
     cells = np.searchsorted(lines[1], place[..., 1]) * columns + np.searchsorted(lines[0], place[..., 0])
     receivers = Receivers(
-        np.argsort(cells[:, 0], kind="stable"),
+        np.argsort(cells, kind="stable"),
         place,
-        cells.astype(np.int32),
+        cells,
         offset.float().contiguous().numpy(),
         soft.float().clamp_min(1e-12).contiguous().numpy(),
     )
     out = np.empty(len(place), np.float32)
-    on_threads(reach, receivers, Lists(starts, ids, rows), slopes.float().contiguous().numpy(), out)
+    on_threads(reach, receivers, Lists(starts, ids, rows), out)
     return torch.from_numpy(out)
 
 
-_SKY_DIRECTIONS = 20
+def disc_directions(
+    light: Annotated[Tensor, "3"], up: Annotated[Tensor, "3"], degrees: float, count: int
+) -> Annotated[Tensor, "count 3"]:
+    """Unit vectors to places spread evenly over a disc of a diameter about a light."""
+    at = torch.arange(count, dtype=torch.float64) + 0.5
+    radius = math.tan(math.radians(degrees / 2)) * (at / count).sqrt()
+    turn = at * (math.pi * (3 - 5**0.5))
+    across = frame_of(light, up)
+    offset = turn.cos()[:, None] * across[0] + turn.sin()[:, None] * across[1]
+    return torch.nn.functional.normalize(across[2] + radius[:, None] * offset, dim=1)
+
+
+_SKY_DIRECTIONS = 16
 """Directions of the sky that openness is the mean of."""
 _LOWEST_SKY = 0.1
 """Sine of the lowest one's height: below it everything is in the way of everything."""
@@ -147,7 +153,7 @@ def sky_directions(up: Annotated[Tensor, "3"], count: int = _SKY_DIRECTIONS) -> 
 @torch.inference_mode()
 def openness(
     blockers: Blockers,
-    points: Annotated[Tensor, "M K 3"],
+    points: Annotated[Tensor, "M 3"],
     normals: Annotated[Tensor, "M 3"],
     up: Annotated[Tensor, "3"],
     offset: Annotated[Tensor, "M"],

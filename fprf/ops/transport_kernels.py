@@ -1,6 +1,6 @@
 """Compiled loops of `fprf.light.transport`: light that reaches points through 3D Gaussians, along one direction.
 
-N Gaussians that take light away, M points that receive it, K rays to each point. Everything is in the frame of
+N Gaussians that take light away, M points that receive it. Everything is in the frame of
 the light: x and y lie across its rays, h grows towards the light. A ray at a place q across meets a Gaussian
 most at the height h + slope (q - mean), where it takes away
 
@@ -22,6 +22,8 @@ from .threads import cached_jit, take
 
 MIN_ALPHA = 1 / 255
 """What takes away less counts as nothing, as in the rasteriser."""
+MAX_POWER = 11.1
+"""2 ln 255: beyond it even an opaque Gaussian takes away less than MIN_ALPHA."""
 MAX_ALPHA = 0.99
 """Light that one Gaussian takes away at most, as in the rasteriser."""
 MIN_LEFT = 1e-3
@@ -32,25 +34,15 @@ _BLOCK = 1024
 """Gaussians or points that a thread takes at a time."""
 
 
-class Widths(NamedTuple):
-    """How Gaussians are widened across the light."""
-
-    blur: np.float32
-    """Variance that is added."""
-    spread: np.float32
-    """What extents grow by for each unit of height above `floor`."""
-    floor: np.float32
-
-
 class Receivers(NamedTuple):
     """Points that receive light, in its frame."""
 
     order: NDArray[np.int64]
     """Numbers of the points, cell by cell."""
     points: NDArray[np.float32]
-    """x y h of the K rays to each [M K 3]."""
-    cells: NDArray[np.int32]
-    """Cell of each ray [M K]."""
+    """x y h [M 3]."""
+    cells: NDArray[np.int64]
+    """Cell of each [M]."""
     offset: NDArray[np.float32]
     """Height above the point up to which Gaussians count nothing [M]."""
     soft: NDArray[np.float32]
@@ -68,12 +60,9 @@ class Lists(NamedTuple):
 
 
 @cached_jit(nogil=True)
-def project(counters, gaussians, frame, widths, out):
-    """Gaussians in the frame [3 3], whose last row leads to the light."""
+def project(counters, gaussians, frame, blur, out):
+    """Gaussians in the frame [3 3], whose last row leads to the light; `blur` is a variance that is added across."""
     means, covariances, opacities = gaussians
-    blur = widths.blur
-    spread = widths.spread
-    floor = widths.floor
     count = len(means)
     while True:
         start = take(counters, 0) * _BLOCK
@@ -116,10 +105,9 @@ def project(counters, gaussians, frame, widths, out):
             row[7] = (yy * xh - xy * yh) / det
             row[8] = (xx * yh - xy * xh) / det
             reach = math.sqrt(max(2 * math.log(max(opacity / MIN_ALPHA, 1e-30)), 0.0))
-            wide = spread * max(h - floor, 0.0)
             row[9] = h + reach * math.sqrt(hh)
-            row[10] = reach * math.sqrt(xx) + wide if opacity > MIN_ALPHA else -1.0
-            row[11] = reach * math.sqrt(yy) + wide if opacity > MIN_ALPHA else -1.0
+            row[10] = reach * math.sqrt(xx) if opacity > MIN_ALPHA else -1.0
+            row[11] = reach * math.sqrt(yy) if opacity > MIN_ALPHA else -1.0
 
 
 @cached_jit(nogil=True)
@@ -145,8 +133,8 @@ def fill(ranges, columns, places, ids):
 
 
 @cached_jit(nogil=True, fastmath={"contract", "arcp"})
-def reach(counters, receivers, lists, slopes, out):
-    """Share of light [M] that reaches points, the mean over K rays of slopes [K 2]."""
+def reach(counters, receivers, lists, out):
+    """Share of light [M] that reaches points."""
     order = receivers.order
     points = receivers.points
     cells = receivers.cells
@@ -156,44 +144,36 @@ def reach(counters, receivers, lists, slopes, out):
     ids = lists.ids
     rows = lists.rows
     total = len(order)
-    rays = points.shape[1]
     while True:
         start = take(counters, 0) * _BLOCK
         if start >= total:
             break
         for k in range(start, min(total, start + _BLOCK)):
             i = order[k]
-            sum_left = np.float32(0)
+            x = points[i, 0]
+            y = points[i, 1]
+            h = points[i, 2]
             near = offset[i]
             inverse = np.float32(1) / soft[i]
-            for ray in range(rays):
-                x = points[i, ray, 0]
-                y = points[i, ray, 1]
-                h = points[i, ray, 2]
-                sx = slopes[ray, 0]
-                sy = slopes[ray, 1]
-                cell = cells[i, ray]
-                left = np.float32(1)
-                for e in range(starts[cell], starts[cell + 1]):
-                    row = rows[ids[e]]
-                    if row[9] <= h + near:
-                        break
-                    up = row[6] - h
-                    dx = x + sx * up - row[0]
-                    dy = y + sy * up - row[1]
-                    power = row[2] * dx * dx + row[4] * dy * dy + np.float32(2) * row[3] * dx * dy
-                    if power > np.float32(11.1):  # 2 ln 255
-                        continue
-                    above = (up + row[7] * dx + row[8] * dy - near) * inverse
-                    if above <= np.float32(0):
-                        continue
-                    alpha = row[5] * math.exp(np.float32(-0.5) * power)
-                    if alpha < np.float32(MIN_ALPHA):
-                        continue
-                    alpha = min(alpha, np.float32(MAX_ALPHA)) * min(above, np.float32(1))
-                    left *= np.float32(1) - alpha
-                    if left < np.float32(MIN_LEFT):
-                        left = np.float32(0)
-                        break
-                sum_left += left
-            out[i] = sum_left / rays
+            cell = cells[i]
+            left = np.float32(1)
+            for e in range(starts[cell], starts[cell + 1]):
+                row = rows[ids[e]]
+                if row[9] <= h + near:
+                    break
+                dx = x - row[0]
+                dy = y - row[1]
+                power = row[2] * dx * dx + row[4] * dy * dy + np.float32(2) * row[3] * dx * dy
+                if power > np.float32(MAX_POWER):
+                    continue
+                above = (row[6] - h + row[7] * dx + row[8] * dy - near) * inverse
+                if above <= np.float32(0):
+                    continue
+                alpha = row[5] * math.exp(np.float32(-0.5) * power)
+                if alpha < np.float32(MIN_ALPHA):
+                    continue
+                left *= np.float32(1) - min(alpha, np.float32(MAX_ALPHA)) * min(above, np.float32(1))
+                if left < np.float32(MIN_LEFT):
+                    left = np.float32(0)
+                    break
+            out[i] = left

@@ -12,7 +12,14 @@ from ..light.config import SunConfig
 from ..light.relight import LINEAR_OFFSET, Received, affine_change, gains
 from ..light.sky import Light, light_of
 from ..light.surfaces import Surfaces, find_surfaces
-from ..light.transport import Blockers, covariances_of, frame_of, openness, transport
+from ..light.transport import (
+    Blockers,
+    covariances_of,
+    disc_directions,
+    frame_of,
+    openness,
+    transport,
+)
 from ..ops.harmonics import recoloured
 from ..rendering.cameras import Cameras
 from .gaussians import Gaussians, bulk_of
@@ -37,8 +44,10 @@ _BLUR_SHARE = 0.0008
 """Deviation by which Gaussians are widened across the light, as a share of the same width at the median: thinner
 than a quarter of a pixel they would hit or miss.
 """
-_SUN_RAYS = 8
-"""Rays to the disc of a sun that is larger than a degree."""
+_SUN_PLACES = 4
+"""Places on the disc of a sun that is larger than a degree: each takes as long as a small sun."""
+_MAX_HARD_DEGREES = 1.0
+"""Diameter up to which a sun is one place: its shadows are blurred by a sixtieth of their distance at most."""
 _MIN_SKY_HEIGHT = 0.02
 """Sine of the height above the middle of the cameras from which on what is far is sky (by eye)."""
 _MIN_SKY_COLOUR = 0.02
@@ -65,10 +74,10 @@ class Illumination:
     """Level direction of the first view: azimuth 0."""
 
     @property
-    def points(self) -> Annotated[Tensor, "N 1 3"]:
+    def points(self) -> Annotated[Tensor, "N 3"]:
         """Points just above the surfaces."""
         away = _LIFT_SHARE * self.offset
-        return (self.surfaces.points + away[:, None] * self.surfaces.normals)[:, None]
+        return self.surfaces.points + away[:, None] * self.surfaces.normals
 
     @property
     def offset(self) -> Annotated[Tensor, "N"]:
@@ -92,13 +101,14 @@ class Illumination:
     def reach(self, sun: Annotated[Tensor, "3"], degrees: float = 0.0) -> Annotated[Tensor, "N"]:
         """Share of the light of a sun of so many degrees that reaches each Gaussian, in [0, 1]."""
         points = self.points
-        slopes = _disc(degrees)
-        if len(slopes) > 1:
-            points = points.expand(-1, len(slopes), -1)
-        frame = frame_of(sun, self.up)
         offset = self.offset
-        found = transport(self.blockers, points, frame, offset, offset, slopes, self.blur)
-        return torch.where(self.far, torch.ones(()), found)
+        places = sun[None]
+        if degrees > _MAX_HARD_DEGREES:
+            places = disc_directions(sun, self.up, degrees, _SUN_PLACES)
+        found = torch.zeros(len(points))
+        for place in places:
+            found += transport(self.blockers, points, frame_of(place, self.up), offset, offset, self.blur)
+        return torch.where(self.far, torch.ones(()), found / len(places))
 
     def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
         """Factors of colours + 0.055 in a light."""
@@ -189,16 +199,6 @@ def world_axes(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], Annotated[Tens
     ahead = (cameras.pose[0, :, 1] - cameras.pose[0, :, 2]).double()
     ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
     return up.float(), ahead.float()
-
-
-def _disc(degrees: float) -> Annotated[Tensor, "K 2"]:
-    """Slopes of rays to a disc of so many degrees, evenly spread; one ray to a small one."""
-    if degrees <= 1.0:
-        return torch.zeros(1, 2)
-    at = torch.arange(_SUN_RAYS) + 0.5
-    radius = math.tan(math.radians(degrees / 2)) * (at / _SUN_RAYS).sqrt()
-    turn = at * (math.pi * (3 - 5**0.5))
-    return torch.stack([radius * turn.cos(), radius * turn.sin()], 1)
 
 
 def mixed_gain(
