@@ -230,7 +230,9 @@ def main(argv: list[str]) -> int:
     )
     parser.add_argument("folder", type=Path, help="empty or new")
     parser.add_argument("--seed", type=int, default=0, help="decides where houses, trees and cars stand")
-    parser.add_argument("--palette", default="day", choices=sorted({**PALETTES, **OTHERS}), help="light and colours")
+    parser.add_argument(
+        "--palette", default="day", choices=sorted({**PALETTES, **OTHERS}), help="light and colours"
+    )
     parser.add_argument("--views", type=int, default=40, help="number of images")
     parser.add_argument("--width", type=int, default=160, help="pixels across an image")
     parser.add_argument("--height", type=int, default=120, help="pixels down an image")

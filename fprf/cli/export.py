@@ -101,8 +101,9 @@ def _styles(config: ExportConfig, what: Plan, file: StyleFile) -> list[tuple[str
     do not do.
     """
     styles = named_styles(config.styles, file)
-    if config.references:
-        styles.insert(0, (tidy(style_name(config.style, config.references)) or "style", file))
+    if config.references or config.light_asked:
+        name = style_name(config.style, config.references) or config.light_name
+        styles.insert(0, (tidy(name) or "style", file))
     names = []
     for name, _ in styles:
         names.append(name.casefold())

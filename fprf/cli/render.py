@@ -335,7 +335,7 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
         # While a look is held it is one scene, which recolours its Gaussians once.
         restyled = functools.lru_cache(maxsize=1)(scene.restyled)
         takes.append(Take("keyframes", lambda frame: restyled(look(frame))))
-    elif config.references:
+    elif config.references or config.light_asked:
         takes.append(_styled_take(scene, "style", file))
     for text in config.styles:
         if text == "plain":

@@ -77,7 +77,9 @@ def run(args: list[str]) -> int:
     tables = []
     for name in explained:
         tables.append(output / name)
-    if config.explain and not config.references:  # regions alone: no style is built
+    if (
+        config.explain and not config.references and not config.light_asked
+    ):  # regions alone: no style is built
         with origin.writing(tables):
             print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
@@ -110,7 +112,7 @@ def run(args: list[str]) -> int:
 def _names(config: StylizeConfig, views: Sequence[str]) -> list[str]:
     """Names of the files of the style that are written into its folder."""
     names: list[str] = []
-    if config.explain and not config.references:
+    if config.explain and not config.references and not config.light_asked:
         return names
     if config.match_only:
         kinds = ["-match.png", "-score.png", "-confidence.png", "-entropy.png"]
@@ -137,7 +139,7 @@ def _folder(config: StylizeConfig, origin: Origin, names: Sequence[str]) -> Path
         origin.check(config.output / name for name in names)
         return config.output
     styles = config.run / "styles"
-    usual = style_name(config.style, config.references) or "regions"
+    usual = style_name(config.style, config.references) or config.light_name or "regions"
     taken: list[str] = []
     name = usual
     while not origin.permits(styles / name / each for each in names):

@@ -73,6 +73,15 @@ class SunConfig:
         return self.light is not None or self.sun is not None
 
     @property
+    def light_name(self) -> str:
+        """A name of the light for files: that of the light, or where the sun stands; empty without one."""
+        if self.light is not None:
+            return self.light
+        if self.sun is not None:
+            return f"sun-{self.sun[0]:g}-{self.sun[1]:g}"
+        return ""
+
+    @property
     def lit(self) -> bool:
         """It changes colours."""
         return self.light_asked and self.sun_strength > 0

@@ -193,7 +193,7 @@ def _light_alone(scene: Scene, file: StyleFile, encoders: Encoders) -> Styled:
     still = file._replace(style=replace(style, strength=0.0))
     own = own_style(encoders.scene_style, style.blend)
     # Of Gaussians the content is the colour: the scene stands in the place of photographs of itself.
-    own = own._replace(colour_mean=own.mean, colour_covariance=own.covariance)
+    own = own._replace(colour_mean=own.mean.clone(), colour_covariance=own.covariance.clone())
     styled = apply_dictionary(scene, still, encoders, own)
     saved = styled.controls.saved
     saved = saved._replace(style=replace(saved.style, strength=style.strength))

@@ -24,6 +24,7 @@ from fprf.splats.pinholes import camera_of
 from fprf.splats.relighting import relit_harmonics, world_axes
 from fprf.splats.scene import SplatScene
 from fprf.style.config import StyleConfig
+from fprf.style.dictionary import save_dictionary
 from fprf.style.files import StyleFile, read_style, write_style
 from fprf.style.restyle import apply_style
 from fprf.training.loading import open_run
@@ -164,3 +165,9 @@ def test_a_capture_looks_alike_after_its_file_was_read_again(tmp_path: Path, sce
 def test_fields_are_told_to_become_gaussians(world: World) -> None:
     with pytest.raises(UsageError, match="fprf export"):
         apply_style(open_run(world.run, device="cpu").scene, StyleFile(StyleConfig(light="noon")))
+
+
+def test_a_light_alone_has_a_dictionary_that_can_be_kept(scene: SplatScene, tmp_path: Path) -> None:
+    styled = apply_style(scene, StyleFile(StyleConfig(light="noon")))
+    save_dictionary(tmp_path / "dictionary.safetensors", styled.dictionary)
+    assert (tmp_path / "dictionary.safetensors").stat().st_size > 0
