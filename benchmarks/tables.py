@@ -74,6 +74,21 @@ def methods(found: Any) -> Rows:
         yield scene, str(row["training_views"]), "x".join(map(str, row["size"])), *told
 
 
+def one_minute(found: Any) -> Rows:
+    """Captures after one minute, before and now."""
+    yield "capture", "size", "steps", "PSNR", "SSIM", "LPIPS"
+    for scene, now in found["scenes"].items():
+        before = now["before"]
+        yield (
+            scene,
+            now["size"],
+            f"{before['steps']} to {now['steps']}",
+            f"{before['psnr']:.2f} dB to {now['psnr']:.2f} dB",
+            f"{before['ssim']:.3f} to {now['ssim']:.3f}",
+            f"{before['lpips']:.3f} to {now['lpips']:.3f}",
+        )
+
+
 def restyle_town_gaussians(found: Any) -> Rows:
     """Restyled town against its truth, with one and with three references."""
     yield (
@@ -199,6 +214,7 @@ TABLES: Mapping[str, Callable[[Any], Rows]] = {
     "splat_training": splat_training,
     "training_steps": training_steps,
     "methods": methods,
+    "one_minute": one_minute,
     "palettes": palettes,
     "restyle_town_gaussians": restyle_town_gaussians,
     "splat_restyle": splat_restyle,
