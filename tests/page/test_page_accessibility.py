@@ -4,6 +4,7 @@ or axe (the package `axe-playwright-python`) is not there.
 
 import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +56,9 @@ def test_the_start_page(page: Any, tmp_path: Path) -> None:
     files = tmp_path / "made" / "yard" / "files"
     files.mkdir(parents=True)
     shutil.copyfile(EXAMPLES["night.jpg"], files / "a.jpg")
-    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+    with ExitStack() as stack, ViewerServer(Access("127.0.0.1", None), 0) as server:
         start = Start(tmp_path / "made", server, lambda path, name: pytest.fail("nothing is opened"))
+        stack.callback(start.close)
         server.show_start(start)
         page.goto(server.address)
         page.locator("#recent li").wait_for()
