@@ -254,16 +254,20 @@ class Captures:
             return styled.styled_harmonics(replace(gaussians, means=means), rows)
         if look is None:
             return gaussians.harmonics
-        features = self.scene.found().features[rows]
+        # Numbers of the sample that the others take from those near to them.
+        found = self.scene.found().features[rows]
+        channels = found.shape[1]
+        if look.lit:
+            found = torch.cat([found.float(), styled.light_gain[rows]], 1)
         # The sample stands where its own capture was moved to: back in its place.
-        near = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], features)
+        near = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], found)
         out = torch.empty_like(gaussians.harmonics)
         for some in pieces(len(out)):
-            out[some] = restyled_harmonics(gaussians.harmonics[some], means[some], near(means[some]), look)
-        if look.lit:
-            light = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], styled.light_gain[rows])
-            for some in pieces(len(out)):
-                out[some] = relit_harmonics(out[some], light(means[some]).float())
+            taken = near(means[some])
+            part = restyled_harmonics(gaussians.harmonics[some], means[some], taken[:, :channels], look)
+            if look.lit:
+                part = relit_harmonics(part, taken[:, channels:].float())
+            out[some] = part
         return out
 
 

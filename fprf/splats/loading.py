@@ -105,8 +105,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
             tensors = run.load_tensors("style")
             if {name: int(tensors.pop(name, torch.tensor(-1))) for name in wanted} == wanted:
                 kept = load_semantics(tensors, len(gaussians))
-                # What was found before views had keypoints tells no photograph of the place.
-                if kept.encoder == encoder().identity and kept.seen is not None:
+                if kept.encoder == encoder().identity:
                     return kept
         every = torch.tensor(known.train)
         views = known.cameras.select(

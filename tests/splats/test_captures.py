@@ -16,6 +16,7 @@ from splat_ball import ball
 from benchmarks.town.write import write_town
 from fprf.cli import main as cli
 from fprf.io.images import srgb_to_linear
+from fprf.light.config import LightName
 from fprf.ops.harmonics import HARMONIC
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
@@ -71,15 +72,18 @@ def look() -> LookConfig:
     return LookConfig(views=6, size=(64, 48), regions=4, semantic=semantic)
 
 
-@pytest.mark.parametrize("far", [0.0, 1e5])
-def test_a_sample_tells_the_colours_of_all(far: float, photograph: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("far", "light"), [(0.0, None), (1e5, None), (1e5, "noon")])
+def test_a_sample_tells_the_colours_of_all(
+    far: float, light: LightName | None, photograph: Path, tmp_path: Path
+) -> None:
     """Strays in the sample, too, are no neighbours of all others."""
     made = ball(4000)
     path = tmp_path / "in.ply"
     made.means[8::800] -= far
     made.means[5] = torch.nan
     write_gaussians(path, made)
-    style = StyleFile(StyleConfig(references=(photograph,), stylizer=RegionToneConfig(centred=False)))
+    stylizer = RegionToneConfig(centred=False)
+    style = StyleFile(StyleConfig(references=(photograph,), stylizer=stylizer, light=light))
     seen = open_captures([path], look(), sample=1000, cache=tmp_path / "cache")
     restyle = apply_style(seen.scene, style).restyle
     found = seen.harmonics(0, seen.first, seen.scene.restyled(restyle))
