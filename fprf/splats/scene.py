@@ -85,7 +85,9 @@ class SplatScene(Scene):
     asked: torch.device = CPU
     """Device to draw views on: the CPU, or a CUDA device if gsplat draws there."""
     illumination: Callable[[], Illumination] | None = None
-    """What light needs to know: asked for when first needed; None = found by each scene that needs it."""
+    """Surfaces, shadows and sky for another light: asked for when first needed; None = found by each scene
+    that needs it.
+    """
     copied: Gaussians | None = None
     """All Gaussians in the scene's look, where they are drawn, if another scene has them already."""
 
@@ -298,7 +300,7 @@ class SplatScene(Scene):
         )
 
     def _landmarks(self) -> Landmarks | None:
-        """What tells photographs of the very place; None where nobody looked."""
+        """Views by which photographs of the very place are told; None where nobody looked."""
         found = self.found()
         seen = found.seen
         if seen is None:
@@ -323,12 +325,12 @@ class SplatScene(Scene):
 
 
 def illuminated(scene: SplatScene) -> Illumination:
-    """What light needs to know of a scene, from its views."""
+    """Find surfaces, shadows and sky of a scene for another light, from its views."""
     return find_illumination(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
 
 
 def with_illumination(scene: SplatScene) -> SplatScene:
-    """The scene with what light needs to know, which is found once, when it is first asked for."""
+    """The scene with its illumination, which is found once, when it is first asked for."""
     return replace(scene, illumination=cache(lambda: illuminated(scene)))
 
 

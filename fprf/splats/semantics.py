@@ -86,7 +86,7 @@ class Semantics(NamedTuple):
     encoder: str
     """Identity of the encoder."""
     seen: SeenViews | None = None
-    """By what photographs of the very place are told; None of what an earlier version found."""
+    """Tell photographs of the very place; None in what an earlier version found."""
 
 
 class _Picture(NamedTuple):

@@ -82,7 +82,7 @@ class Encoders(NamedTuple):
     seed: int = 0
     """Of the clusters of a style dictionary."""
     landmarks: Landmarks | None = None
-    """What tells photographs of the very place; None = nobody looks."""
+    """Views of the scene that tell photographs of the very place; None = nobody looks."""
 
 
 class Reference(NamedTuple):

@@ -41,7 +41,7 @@ from .config import NO_MASK, StyleConfig
 _STYLE_FORMAT = 1
 """Of style.json: counts up when an older fprf could not read it."""
 _SCHEMA_KEY = "$schema"
-"""Where a file's schema is, for editors (`fprf config-schema`)."""
+"""Key of the place of a file's schema, for editors (`fprf config-schema`)."""
 _STYLE_KEYS = (
     _SCHEMA_KEY,
     "format",

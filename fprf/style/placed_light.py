@@ -39,7 +39,7 @@ _MAX_LOG_GAIN = 1.5
 
 
 class Measured(NamedTuple):
-    """What measured light does to points: c' = c + share (light (c + o) - rest), with the rest of the look."""
+    """Measured light of points: c' = c + (1 - share) (change by the rest of the look) + excess (c + o)."""
 
     share: Annotated[Tensor, "N 1"]
     """Part of the look that is measured, in [0, 1]."""
@@ -47,7 +47,7 @@ class Measured(NamedTuple):
     """Gains less 1, by the shares of the references."""
 
     def change(self, colour: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-        """What is added to the scene's own colours."""
+        """Change to add to the scene's own colours."""
         return self.excess * (colour + BLACK_OFFSET)
 
     @property
@@ -62,7 +62,7 @@ class PlacedLight(nn.Module):
     gains: Annotated[Tensor, "R D+K+1 3"]
     """Coefficients of logarithms of gains: W, V and b."""
     trust: Annotated[Tensor, "K R"]
-    """How far a region takes them, of each reference; rows sum to 1 at most."""
+    """Share of each reference's gains that a region takes; rows sum to 1 at most."""
 
     def __init__(
         self,
@@ -142,6 +142,6 @@ def placed_light(
 
 
 def _support(pairs: Pairs, belongs: Annotated[Tensor, "N K"]) -> Annotated[Tensor, "K"]:
-    """How far pairs speak of each region, in [0, 1), float64."""
+    """Trust in each region by the number of its pairs, in [0, 1), float64."""
     count = double(belongs).sum(0)
     return count / (count + _MIN_SURE_PAIRS)

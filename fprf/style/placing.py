@@ -140,7 +140,7 @@ def matches(
         return none, none
     # Descriptors have the length of their scale, all but for rounding.
     alike = a @ b.T
-    (best, nearest) = alike.topk(2, dim=1)
+    best, nearest = alike.topk(2, dim=1)
     distance = 2 - 2 * best / _DESCRIPTOR_SCALE**2
     back = alike.argmax(0)
     mutual = back[nearest[:, 0]] == torch.arange(len(a))
@@ -188,7 +188,7 @@ def register(
 
 
 def _within(at: Annotated[Tensor, "N 2"], size: tuple[int, int]) -> Annotated[Tensor, "N"]:
-    """Which positions lie in a picture of a size (width, height)."""
+    """Mask (bool) of the positions that lie in a picture of a size (width, height)."""
     return ((at >= 0) & (at < at.new_tensor(size))).all(1)
 
 
@@ -219,7 +219,7 @@ def find_place(
     for known, view in found[:_MAX_VIEWS]:
         if known.agreeing >= least:
             parts.append(_seen_in(landmarks.samples(view), known, smooth, where))
-    (own, shown, semantic) = (torch.cat(each) for each in zip(*parts, strict=True))
+    own, shown, semantic = (torch.cat(each) for each in zip(*parts, strict=True))
     if len(own) == 0:
         return None
     return Pairs(own, shown, semantic, found[0][0].agreeing)

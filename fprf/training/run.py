@@ -52,7 +52,7 @@ _RUN_FILES = (
     "cells",
     "overview",
 )
-"""What training writes into a run folder (docs/design.md)."""
+"""Files and folders that training writes into a run folder (docs/design.md)."""
 _MAX_SOME = 8
 """Views of the split `some`, at most."""
 _CAMERA = {"pose": (3, 4), "focal": (2,), "centre": (2,), "size": (2,), "distortion": (6,), "lens": ()}
