@@ -18,9 +18,9 @@ LEAD = (
     "Trained on a CPU from 25 photographs. Each look is then taken from one photograph, without training, and is the same "
     "from every viewpoint."
 )
-LOOKS = ("sunrise", "morning", "sunset", "night")
+LOOKS = ("Sunrise", "Morning", "Sunset", "Night")
 """References, in the order in which they are shown."""
-ALL_TOGETHER = "all together"
+ALL_TOGETHER = "All together"
 """Name of the style of all references."""
 CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
@@ -73,7 +73,7 @@ def run(args: list[str]) -> int:
     output = config.output / "run"
     captures = {}
     for name in (*LOOKS, ALL_TOGETHER):
-        captures[name] = config.output / f"{name.replace(' ', '-')}.ply"
+        captures[name] = config.output / f"{name.lower().replace(' ', '-')}.ply"
     page = config.output / "garden.html"
     table = config.output / "metrics.json"
     origin = Origin(by="demo", overwrite=config.overwrite)
@@ -89,7 +89,7 @@ def run(args: list[str]) -> int:
     views = opened.known.test
     names = {}
     for name in LOOKS:
-        names[GARDEN / "references" / f"{name}.jpg"] = name
+        names[GARDEN / "references" / f"{name.lower()}.jpg"] = name
     chosen = []
     for path, name in names.items():
         chosen.append((name, StyleFile(StyleConfig(references=(path,)))))

@@ -46,7 +46,7 @@ _MAX_PAGE_CAMERAS = 48
 """Captured cameras that one can go to, at most; by eye."""
 _MAX_SEEN_CAMERAS = 256
 """Cameras that say what was photographed, at most; by eye: frames of neighbours overlap."""
-_PHOTOGRAPHS_FILL = 0.55
+_PHOTOGRAPHS_FILL = 0.75
 """How far a stage of another format is filled, from 0 (all of a photograph is seen) to 1 (nothing beyond it is);
 by eye. Views of captures show whole objects.
 """

@@ -11,6 +11,7 @@ const MANY = 1024; // quads of an instance: one quad each costs software, and mo
 const COARSE = 8; // pixels a side of what is found out about depths: the edges that they make are soft
 const EVERY = 2; // of the Gaussians, one is asked for its depth
 const SEEN_BY = 3; // photographs that shall have seen a thing, where so many were taken around here
+const UNSEEN = 0.5; // share of them, up to which nothing is shown; by eye: single dark things stand out at the rim
 const BORDER = 0.12; // of a frame's side, within which it counts less; by eye
 const AROUND = 0.4; // how far from here photographs count, in the distance of what they look at; by eye
 const FARTHEST = 1.5; // beyond so many of these distances nothing is told apart: through gaps one sees what nobody photographed
@@ -138,7 +139,7 @@ void main() {
     float apart = max(0., distance(eye, texelFetch(seen, ivec2(3, k), 0).xyz) - nearest) / around;
     if (f.z > 0.) sum += within.x * within.y * exp(-apart * apart);
   }
-  o = vec4(smoothstep(0., 1., sum / needed));
+  o = vec4(smoothstep(${UNSEEN}, 1., sum / needed));
 }`;
 const SHOW = `${COMMON}
 uniform sampler2D picture, cover; uniform vec2 scale, whole, corner; uniform vec3 background, rim; uniform bool faded; out vec4 o;
