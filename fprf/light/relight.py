@@ -26,15 +26,15 @@ from .sky import Light
 
 LINEAR_OFFSET = 0.055
 """Added to sRGB, it is a power of linear light."""
-_SHOULDER = 0.7
+SHOULDER = 0.7
 """s above. On the town 0.6 and 0.85 are 0.2 to 0.6 dB better than none, and alike."""
-_GROUND_ALBEDO = 0.2
+GROUND_ALBEDO = 0.2
 """Share of light that the ground sends back (grass 0.25, asphalt 0.12, concrete 0.4); on the town 0.15 is better
 than 0.4 by 0.1 to 0.6 dB.
 """
 _MIN_OPENNESS = 0.02
 """Of what lies in the darkest corner, so that ratios are finite."""
-_MAX_GAIN = 2.5
+MAX_GAIN = 2.5
 """Of c + 0.055: more would show what the capture has of noise in its shade (by eye)."""
 _METERED_GAUSSIANS = 8192
 """Gaussians that brightness is measured on, about."""
@@ -60,23 +60,38 @@ def irradiance(
     received: Received, light: Light, sun: Annotated[Tensor, "3"], up: Annotated[Tensor, "3"]
 ) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
     """Light on surfaces, and the share of the sun's that meets them; `sun` and `up` are unit vectors."""
-    level = (received.normals @ up + 1) / 2
-    facing = received.normals @ sun
-    # Of a volume, such as a crown, some side always faces the sun.
-    around = (facing + 1).square() / 4
-    meets = received.reach * torch.lerp(around, facing.clamp_min(0), received.sure)
-    bounce = _GROUND_ALBEDO * (light.sky + light.sun * (sun @ up).clamp_min(0))
-    sky = level[:, None] * light.sky + (1 - level)[:, None] * bounce
-    opened = received.openness.clamp_min(_MIN_OPENNESS).sqrt()[:, None]
-    return meets[:, None] * light.sun + opened * sky, meets
+    level = level_share(received, up)
+    meets = sun_share(received, sun)
+    sky = level[:, None] * light.sky + (1 - level)[:, None] * bounced(light, sun, up)
+    return meets[:, None] * light.sun + sky_share(received)[:, None] * sky, meets
 
 
 def captured_irradiance(received: Received, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "N 3"]:
     """The captured light, taken to be that of clouds or shade."""
-    level = ((received.normals @ up + 1) / 2)[:, None]
-    return received.openness.clamp_min(_MIN_OPENNESS).sqrt()[:, None] * (
-        level + (1 - level) * _GROUND_ALBEDO
-    ).expand(-1, 3)
+    level = level_share(received, up)[:, None]
+    return sky_share(received)[:, None] * (level + (1 - level) * GROUND_ALBEDO).expand(-1, 3)
+
+
+def level_share(received: Received, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "N"]:
+    """u above: how far surfaces face the sky, in [0, 1]; the rest faces the ground."""
+    return (received.normals @ up + 1) / 2
+
+
+def sky_share(received: Received) -> Annotated[Tensor, "N"]:
+    """O^(1/2) above, in [0.14, 1]."""
+    return received.openness.clamp_min(_MIN_OPENNESS).sqrt()
+
+
+def sun_share(received: Received, sun: Annotated[Tensor, "3"]) -> Annotated[Tensor, "N"]:
+    """T max(0, n l) above, in [0, 1]: of a volume, such as a crown, some side always faces the sun."""
+    facing = received.normals @ sun
+    around = (facing + 1).square() / 4
+    return received.reach * torch.lerp(around, facing.clamp_min(0), received.sure)
+
+
+def bounced(light: Light, sun: Annotated[Tensor, "3"], up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "3"]:
+    """Light that the ground sends back."""
+    return GROUND_ALBEDO * (light.sky + light.sun * (sun @ up).clamp_min(0))
 
 
 def gains(
@@ -90,15 +105,29 @@ def gains(
     """k of each Gaussian, at a brightness that keeps the mean luma of what is lit; `weights` say how much of
     each is seen.
     """
+    before = linear(colours.clamp(0, 1))
+    ratio, exposure = exposed(received, light, sun, up, before, weights)
+    after = encoded(_compressed(before, exposure * ratio))
+    gain = (after + LINEAR_OFFSET) / (encoded(before) + LINEAR_OFFSET)
+    return gain.clamp_max(MAX_GAIN)
+
+
+def exposed(
+    received: Received,
+    light: Light,
+    sun: Annotated[Tensor, "3"],
+    up: Annotated[Tensor, "3"],
+    before: Annotated[Tensor, "N 3"],
+    weights: Annotated[Tensor, "N"],
+) -> tuple[Annotated[Tensor, "N 3"], float]:
+    """E / E0 above, and the exposure e: the mean luma of what is lit of the linear colours `before` stays, or
+    becomes the light's share of it.
+    """
     new, meets = irradiance(received, light, sun, up)
     ratio = new / captured_irradiance(received, up)
     if bool(light.sun.any()):
         weights = weights * meets
-    before = linear(colours.clamp(0, 1))
-    exposure = _exposure(before, ratio, weights, light.brightness)
-    after = encoded(_compressed(before, exposure * ratio))
-    gain = (after + LINEAR_OFFSET) / (encoded(before) + LINEAR_OFFSET)
-    return gain.clamp_max(_MAX_GAIN)
+    return ratio, _exposure(before, ratio, weights, light.brightness)
 
 
 def linear(colour: Tensor) -> Tensor:
@@ -115,8 +144,8 @@ def encoded(light: Tensor) -> Tensor:
 
 def _compressed(light: Tensor, factor: Tensor) -> Tensor:
     """Linear light of which the scene has `factor` times as much, behind a camera's shoulder."""
-    scene = factor * light / (1 - _SHOULDER * light)
-    return scene / (1 + _SHOULDER * scene)
+    scene = factor * light / (1 - SHOULDER * light)
+    return scene / (1 + SHOULDER * scene)
 
 
 def _exposure(

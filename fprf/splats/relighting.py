@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -50,9 +50,9 @@ _MAX_HARD_DEGREES = 1.0
 """Diameter up to which a sun is one place: its shadows are blurred by a sixtieth of their distance at most."""
 _MIN_SKY_HEIGHT = 0.02
 """Sine of the height above the middle of the cameras from which on what is far is sky (by eye)."""
-_MIN_SKY_COLOUR = 0.02
+MIN_SKY_COLOUR = 0.02
 """Linear light that a captured sky has at least."""
-_MAX_SKY_GAIN = 4.0
+MAX_SKY_GAIN = 4.0
 """Of a sky's linear light (by eye)."""
 
 
@@ -128,19 +128,42 @@ class Illumination:
         """Factors of colours + 0.055 that give the captured sky, in the mean at each height, the light's own
         colours.
         """
+        height = self.heights[self.sky].clamp(0, 1)[:, None]
+        captured = self.captured_sky(gaussians)
+        mean = captured.mean_at(height)
+        wanted = torch.lerp(light.horizon, light.zenith, height.sqrt())
+        gain: Tensor = (captured.level(light) * wanted / mean).clamp_max(MAX_SKY_GAIN).pow(1 / 2.4)
+        return gain
+
+    def captured_sky(self, gaussians: Gaussians) -> "CapturedSky":
+        """Colours of the captured sky by height."""
         height = self.heights[self.sky].clamp(0, 1)
         linear = (gaussians.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
         weight = (self.surfaces.weights[self.sky] + 1e-6)[:, None]
         rows = torch.stack([torch.ones_like(height), height], 1)
         fit = torch.linalg.lstsq((rows * weight.sqrt()).double(), (linear * weight.sqrt()).double()).solution
-        mean = (rows @ fit.float()).clamp_min(_MIN_SKY_COLOUR)
-        wanted = torch.lerp(light.horizon, light.zenith, height.sqrt()[:, None])
-        # The sky stays as bright as it is, but for what the light asks.
-        level = light.brightness * float((mean * weight).sum() / (3 * weight.sum()))
+        found = CapturedSky(fit.float(), 0.0)
+        mean = found.mean_at(height[:, None])
+        return found._replace(brightness=float((mean * weight).sum() / (3 * weight.sum())))
+
+
+class CapturedSky(NamedTuple):
+    """The sky as captured, in linear light."""
+
+    fit: Annotated[Tensor, "2 3"]
+    """Colour at the horizon, and what the height adds to it."""
+    brightness: float
+
+    def mean_at(self, height: Annotated[Tensor, "S 1"]) -> Annotated[Tensor, "S 3"]:
+        """Colours at sines of heights in [0, 1]."""
+        return (self.fit[0] + height * self.fit[1]).clamp_min(MIN_SKY_COLOUR)
+
+    def level(self, light: Light) -> float:
+        """Brightness in another light: the sky stays as bright as it is, but for what the light asks."""
+        level = light.brightness * self.brightness
         if bool(light.sun.any()):
             level *= _CLEAR_SKY_SHARE
-        gain: Tensor = (level * wanted / mean).clamp_max(_MAX_SKY_GAIN).pow(1 / 2.4)
-        return gain
+        return level
 
 
 _CLEAR_SKY_SHARE = 0.55
