@@ -7,6 +7,7 @@ from statistics import fmean
 
 from ..checks import at_least, positive
 from ..io.overwriting import Origin, OverwriteConfig
+from ..light.day import check_suns
 from ..progress import Display
 from ..style.config import StyleConfig
 from ..style.files import StyleFile
@@ -40,10 +41,13 @@ class DemoConfig(OverwriteConfig):
     """The photographs, 356x634, are reduced by this factor."""
     megabytes: float = 3.8
     """Size of the page, at most; Gaussians that show least are left out of it."""
+    suns: int = 12
+    """Suns of a day on the page, from 2 to 64; one chooses the time there. 0 = none."""
 
     def __post_init__(self) -> None:
         positive("minutes", self.minutes)
         positive("megabytes", self.megabytes)
+        check_suns(self.suns)
         at_least("downscale", self.downscale, 1)
 
 
@@ -131,6 +135,7 @@ def run(args: list[str]) -> int:
             ],
             scene=scene,
             start=views[0],
+            suns=config.suns,
             credits=CREDITS,
         )
         write_page(page, content, megabytes=config.megabytes)

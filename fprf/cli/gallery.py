@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ..checks import at_least, positive
 from ..errors import FprfError, UsageError
+from ..light.day import check_suns
 from ..progress import Display
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from .style_flags import StyledRunConfig, origin_of, read_flags, say, style_name
@@ -43,6 +44,10 @@ class GalleryConfig(StyledRunConfig):
     """Headline; empty = the scene's name."""
     megabytes: float = 16.0
     """Size of the page, at most; Gaussians that show least are left out of it."""
+    suns: int = 12
+    """Suns of a day on the page, from 2 to 64, for runs of Gaussians; one chooses the time there. 0 = none. Each adds
+    about a hundredth to its size.
+    """
     output: Path | None = None
     """The page; by default RUN/gallery.html."""
     address: str = ""
@@ -54,6 +59,7 @@ class GalleryConfig(StyledRunConfig):
         super().__post_init__()
         at_least("most", self.most, 1)
         positive("megabytes", self.megabytes)
+        check_suns(self.suns)
 
 
 def run(args: list[str]) -> int:
@@ -106,6 +112,7 @@ def run(args: list[str]) -> int:
         references=[Reference(name, load_preview(path, REFERENCE_PIXELS)) for path, name in called.items()],
         scene=scene if isinstance(scene, SplatScene) else None,
         start=views[0],
+        suns=config.suns,
         address=config.address,
     )
     with origin.writing(outputs):
@@ -244,6 +251,7 @@ def page_styles(
             references=[called[paths[label]] for label in names],
             shares=shares if len(shares) == len(names) else [],
             matches=maps,
+            lit=styled.restyle.lit,
         )
         made.append((style, look, seconds))
     display.count(len(chosen), len(chosen), "restyling")

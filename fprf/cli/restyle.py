@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..checks import positive
 from ..errors import DataError, UsageError
 from ..io.overwriting import Origin, OverwriteConfig, same_file, unused_name
+from ..light.day import check_suns
 from ..plugins.captures import captures_in, endings, format_name, is_scene, stem_of
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..progress import Display
@@ -74,6 +75,10 @@ class RestyleConfig(StyleConfig, LookConfig, OverwriteConfig):
     """A web page (.html) to walk through the capture before and after; it loads nothing and can be sent."""
     megabytes: float = 16.0
     """Size of that page, at most; Gaussians that show least are left out of it."""
+    suns: int = 12
+    """Suns of a day on that page, from 2 to 64; one chooses the time there. 0 = none. Each adds
+    about a hundredth to its size.
+    """
     explain: bool = False
     """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside
     the output.
@@ -87,6 +92,7 @@ class RestyleConfig(StyleConfig, LookConfig, OverwriteConfig):
         StyleConfig.__post_init__(self)
         LookConfig.__post_init__(self)
         positive("megabytes", self.megabytes)
+        check_suns(self.suns)
 
 
 class _CaptureFile(NamedTuple):
@@ -606,7 +612,8 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
         of = [names[k]] if config.each else each.styled.dictionary.names
         name = each.name or " + ".join(Path(label).stem for label in of)
         harmonics = each.scene.shown.harmonics
-        styles.append(Style(name, pictures, harmonics, references=of))
+        lit = each.styled.restyle.lit
+        styles.append(Style(name, pictures, harmonics, references=of, lit=lit))
     page = Page(
         title=stem_of(config.captures[0]) or "capture",
         facts={
@@ -621,6 +628,7 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
         ],
         scene=scene,
         start=views[0],
+        suns=config.suns,
     )
     count = write_page(path, page, megabytes=config.megabytes)
     if count < len(scene.gaussians):

@@ -1,8 +1,8 @@
 """The page that shows a scene in 3D: one file (`fprf restyle --page`), or served with a scene behind it
 (`fprf view`).
 
-- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `send.js` has links and headsets, `page.js`
-  the controls: every page has these, `stage.html` and `page.css`; `page.html` is the file that one sends;
+- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `send.js` has links and headsets, `sun.js`
+  the light, `page.js` the controls: every page has these, `stage.html` and `page.css`; `page.html` is the file that one sends;
   `live.*`, `panel.*`, `field.js`, `photographs.js`, `start.js` are the served page).
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
 - Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`,
@@ -31,9 +31,9 @@ def css(*more: str) -> str:
     """The styles of every page with their typeface, and `more`, one after the other."""
     font = base64.b64encode((files(__package__) / "web" / "fonts" / "figtree.woff2").read_bytes()).decode()
     face = f'@font-face {{ font-family: Figtree; font-weight: 300 900; src: url("data:font/woff2;base64,{font}"); }}'
-    return "\n".join([face, *map(read_asset, ("page.css", *more))])
+    return "\n".join([face, *map(read_asset, ("page.css", "sun.css", *more))])
 
 
 def script(*more: str) -> str:
     """The scripts of every page, and `more`, one after the other."""
-    return "\n".join(map(read_asset, ("splats.js", "place.js", "send.js", "page.js", *more)))
+    return "\n".join(map(read_asset, ("splats.js", "place.js", "send.js", "sun.js", "page.js", *more)))

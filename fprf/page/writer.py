@@ -28,6 +28,7 @@ from ..splats.pinholes import camera_of, covering
 from ..splats.scene import SplatScene
 from . import css, read_asset, script
 from .pack import Packed, colour_header, colour_section, header, pack, sections
+from .suns import Suns, packed_day
 
 CAPTURED = "Captured"
 _STAGE_PIXELS = 800
@@ -86,6 +87,8 @@ class Style(NamedTuple):
     """Share of the scene that each of them styled; none where that was not measured."""
     matches: Sequence[Picture] = ()
     """Match maps, one per view or fewer."""
+    lit: bool = False
+    """It has a light of its own, in the place of those of the page's day."""
 
 
 class PageView(NamedTuple):
@@ -113,6 +116,8 @@ class Page:
     """The Gaussians as captured; None = the stage shows pictures."""
     start: int = 0
     """Camera of the scene that the stage begins at."""
+    suns: int = 0
+    """Suns of a day that falls on the Gaussians, where there are any; 0 = none."""
     credits: Sequence[str] = ()
     address: str = ""
     """Where it will lie on the web (https://…/garden.html): chats show the picture beside it."""
@@ -164,8 +169,11 @@ def page_html(
     # the views.
     empty = len(fixed.encode())
     kept = None
+    suns = None
+    if page.suns:
+        suns = packed_day(scene.light_found, scene.gaussians, page.suns, 0.0)
     for _ in range(_MAX_FITTING_ROUNDS):
-        _, head, parts = packed_scene(scene, harmonics, page.start, kept)
+        _, head, parts = packed_scene(scene, harmonics, page.start, kept, suns=suns)
         text = _text(page, head, parts)
         size = len(text.encode())
         count = int(head["count"])
@@ -205,9 +213,10 @@ def packed_scene(
     start: int,
     kept: Annotated[Tensor, "n"] | None = None,
     level: int = 9,
+    suns: Suns | None = None,
 ) -> tuple[Packed, dict[str, Any], dict[str, bytes]]:
-    """Pack a scene's Gaussians, of those `kept`, in several colours, of which the first is captured; return
-    the head and the deflated sections that the page reads, too.
+    """Pack a scene's Gaussians, of those `kept`, in several colours, of which the first is captured, and the
+    lights of a day on all of them; return the head and the deflated sections that the page reads, too.
 
     The page begins at the camera `start`. `level` of deflating: 1 where somebody waits.
     """
@@ -222,7 +231,10 @@ def packed_scene(
         colours = packed.colours(each)
         styles.append(colour_header(colours))
         parts[f"style-{k}"] = colour_section(colours, level)
+    if suns is not None:
+        parts["light"] = suns.section(packed.order if kept is None else kept[packed.order], level)
     drawing = {
+        "light": None if suns is None else suns.header,
         "antialiased": scene.antialiased,
         "near": scene.near,
         "background": list(scene.background),
@@ -321,12 +333,13 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     for row in pictures:
         stills.append([data_uri(shrink(each, _STAGE_PIXELS)) for each in row[:most]])
     made_of = [[], *(list(style.references) for style in page.styles)]
+    lit = [False, *(style.lit for style in page.styles)]
     heads = [{}] * len(names) if head is None else head["styles"]
     data = {
         "scene": None if head is None else {key: value for key, value in head.items() if key != "styles"},
         "styles": [
-            {"name": name, "of": of, **about_colours}
-            for name, of, about_colours in zip(names, made_of, heads, strict=True)
+            {"name": name, "of": of, "lit": own, **about_colours}
+            for name, of, own, about_colours in zip(names, made_of, lit, heads, strict=True)
         ],
         "references": {each.name: data_uri(_thumbnail(each.image)) for each in page.references},
         "stills": dict(zip(names, stills, strict=True)),

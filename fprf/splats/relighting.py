@@ -110,14 +110,24 @@ class Illumination:
             found += transport(self.blockers, points, frame_of(place, self.up), offset, offset, self.blur)
         return torch.where(self.far, torch.ones(()), found / len(places))
 
-    def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
-        """Factors of colours + 0.055 in a light."""
+    @property
+    def received(self) -> Received:
+        """What all Gaussians receive, but for the sun."""
+        none = torch.zeros(len(self.far))
+        return Received(self.surfaces.normals, self.surfaces.sure, self.openness, none)
+
+    def under(self, config: SunConfig) -> tuple[Light, Annotated[Tensor, "3"], Received]:
+        """A light, the unit vector to its sun, and what all Gaussians receive."""
         light, azimuth = light_of(config)
         sun = self.sun_direction(azimuth, light.elevation)
-        reach = torch.zeros(len(gaussians))
+        received = self.received
         if bool(light.sun.any()):
-            reach = self.reach(sun, config.sun_size)
-        received = Received(self.surfaces.normals, self.surfaces.sure, self.openness, reach)
+            received = received._replace(reach=self.reach(sun, config.sun_size))
+        return light, sun, received
+
+    def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
+        """Factors of colours + 0.055 in a light."""
+        light, sun, received = self.under(config)
         weights = torch.where(self.sky, torch.zeros(()), self.surfaces.weights)
         gain = gains(received, light, sun, self.up, gaussians.colours, weights)
         if bool(self.sky.any()):

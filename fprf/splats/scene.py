@@ -154,11 +154,14 @@ class SplatScene(Scene):
     def light_gain(self) -> Annotated[Tensor, "N 3"]:
         """Factors of colours + 0.055 in the light of the scene's look."""
         assert self.look is not None  # by `styled_harmonics`
+        return mixed_gain(self.light_found, self.gaussians, self.look.lights)
+
+    @property
+    def light_found(self) -> Illumination:
+        """Surfaces, shadows and sky for another light."""
         if self.illumination is None:
-            known = illuminated(self)
-        else:
-            known = self.illumination()
-        return mixed_gain(known, self.gaussians, self.look.lights)
+            return illuminated(self)
+        return self.illumination()
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""

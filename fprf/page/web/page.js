@@ -40,7 +40,7 @@ class Pictures {
 }
 
 const MOST_SHOWN = 4; // photographs beside a style that is of several; by eye
-const PANELS = { see: "seeing", send: "sending", how: "help" }; // buttons and what they open
+const PANELS = { light: "lighting", see: "seeing", send: "sending", how: "help" }; // buttons and what they open
 const SWEEP_MS = 4200; // that the line takes on its way across, once; by eye
 
 // One plain sentence on the stage, where it cannot be what it should be; without words there is none.
@@ -188,6 +188,7 @@ class Stage {
     else if (event.code === "KeyC") this.compare();
     else if (event.code === "KeyV") this.place.step(event.shiftKey ? -1 : 1);
     else if (event.code === "KeyR") this.place.home();
+    else if (event.code === "KeyL" && !at("light").hidden) this.unfold("light");
     else if (event.key === "?" || event.code === "KeyH") this.unfold("how");
     else if (event.key === "Escape") {
       this.unfold(null);
@@ -225,6 +226,11 @@ const open = async (data) => {
     }
   } else place = fall("");
   const stage = new Stage(place, styles.slice(0, 1));
+  if (place.splats && data.scene.light) {
+    stage.light = new Daylight(place, data.scene.light, await inflate(section("light")));
+    document.querySelector("[data-light=moonlight]").hidden = true; // of it nothing was computed
+    stage.light.cover(styles[0].name);
+  }
   window.fprf = { place, stage };
   if (place.splats) {
     place.listeners.lost = (lost) => {
@@ -246,6 +252,7 @@ const open = async (data) => {
       await new Promise((done) => setTimeout(done, 0)); // a picture between two styles
     }
     stage.add(styles[k]);
+    if (!style.lit) stage.light?.cover(style.name);
     if (k === 1 && !location.hash) stage.begin(styles[k].name);
   }
   if (location.hash && !stage.sending.read() && styles[1]) stage.begin(styles[1].name);

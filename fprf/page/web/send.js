@@ -30,13 +30,14 @@ class Sending {
 
   /** @returns {string} what stands behind # for what is seen now */
   get hash() {
-    const { place, to } = this.stage, parts = new URLSearchParams();
+    const { place, to, light } = this.stage, parts = new URLSearchParams();
     if (place instanceof Place) {
       const { camera, zoom, scene } = place, [right, down] = levelled(camera.axes[2], scene.up);
       const roll = Math.atan2(dot(camera.axes[0], down), dot(camera.axes[0], right));
       parts.set("v", [...camera.place, ...camera.axes[2], roll, camera.distance, zoom].map((x) => Number(x.toPrecision(5))).join(","));
     }
     if (to) parts.set("s", to);
+    if (light?.hash) parts.set("l", light.hash);
     return parts.toString().replaceAll("%2C", ",");
   }
 
@@ -48,6 +49,7 @@ class Sending {
     const given = new URLSearchParams(location.hash.slice(1)), { stage } = this, { place } = stage;
     const view = (given.get("v") ?? "").split(",").map(Number);
     if (place instanceof Place && view.length === VIEW_NUMBERS && view.every(Number.isFinite) && view[7] > 0 && view[8] > 0) this.stand(view);
+    stage.light?.read?.(given.get("l"));
     const style = stage.styles.find(({ name }) => name === this.asked);
     if (style) stage.set({ to: style.name, amount: 1, wiping: false });
     return Boolean(style);

@@ -23,6 +23,7 @@ uniform usampler2D shape;               // a texel a Gaussian, see pack.py
 uniform sampler2D chunks, palette;
 uniform sampler2D first, second;        // a texel a Gaussian: mean colour, number of the map
 uniform sampler2D maps0, maps1;         // three texels a map
+uniform sampler2D gains0, gains1; uniform bool lit0, lit1; // of light: factors of colours + 0.055
 uniform mat4 range0, range1;            // columns 0 and 1: least colour and width
 uniform mat4 view; uniform vec4 lens; uniform vec2 size; uniform float near, blend, wipe, largest; uniform vec3 eye;
 uniform int bands; uniform bool depth; uniform bool sharp; uniform float wider;
@@ -30,14 +31,14 @@ layout(location = 0) in uint index;
 flat out uvec4 place; // bits of the floats: centre in the picture, longer half axis at one standard deviation
 flat out uvec4 look;  // half floats: colour, opacity; shorter half axis over the longer, how many deviations the quad reaches; depth
 ivec2 texel(int i) { return ivec2(i % ${WIDTH}, i / ${WIDTH}); }
-vec3 shaded(vec4 texel4, mat4 range, sampler2D maps, vec3 rest) {
+vec3 shaded(vec4 texel4, mat4 range, sampler2D maps, vec3 rest, vec3 gain) {
   vec3 mean = range[0].xyz + texel4.rgb * range[1].xyz;
   if (bands > 1) {
     int m = int(texel4.a * 255. + .5) * 3;
     mean += rest.x * texelFetch(maps, ivec2(m, 0), 0).rgb + rest.y * texelFetch(maps, ivec2(m + 1, 0), 0).rgb
       + rest.z * texelFetch(maps, ivec2(m + 2, 0), 0).rgb;
   }
-  return max(mean, 0.);
+  return max(gain * (mean + .055) - .055, 0.);
 }
 vec3 entry(int i) { vec3 v = texelFetch(palette, texel(i), 0).rgb; return largest * v * abs(v); }
 void main() {
@@ -91,8 +92,8 @@ void main() {
     }
   }
   float m = wipe >= 0. ? step(wipe * size.x, centre.x) : blend;
-  vec3 shown = m < 1. ? shaded(texelFetch(first, texel(int(index)), 0), range0, maps0, rest) : vec3(0.);
-  if (m > 0.) shown = mix(shown, shaded(texelFetch(second, texel(int(index)), 0), range1, maps1, rest), m);
+  vec3 shown = m < 1. ? shaded(texelFetch(first, texel(int(index)), 0), range0, maps0, rest, lit0 ? texelFetch(gains0, texel(int(index)), 0).rgb : vec3(1.)) : vec3(0.);
+  if (m > 0.) shown = mix(shown, shaded(texelFetch(second, texel(int(index)), 0), range1, maps1, rest, lit1 ? texelFetch(gains1, texel(int(index)), 0).rgb : vec3(1.)), m);
   look = uvec4(packHalf2x16(shown.rg), packHalf2x16(vec2(shown.b, alpha)), wide, far);
 }`;
 const NOTHING = `${COMMON}void main() {}`;
@@ -205,7 +206,7 @@ const woven = (planes, count, width) => {
 class Splats {
   // Throws where WebGL 2 is missing. Shaders compile in the graphics process while this one inflates what is loaded.
   constructor(canvas) {
-    Object.assign(this, { canvas, styles: new Map(), colours: new Map(), textures: {} });
+    Object.assign(this, { canvas, styles: new Map(), colours: new Map(), lights: new Map(), textures: {} });
     this.compile();
   }
 
@@ -218,6 +219,7 @@ class Splats {
     const coloured = [...this.styles.values()].flatMap(({ rows, maps }) => [rows, maps]);
     [...Object.values(this.textures), ...coloured].forEach((texture) => this.gl.deleteTexture(texture));
     this.colours.clear();
+    this.light([...this.lights.keys()], null);
     this.worker?.terminate();
     this.sorted?.(); // a sort that was under way is never answered
     Object.assign(this, { head, count: head.count, order: null, kept: 0, every: 1, sortMilliseconds: 0 });
@@ -274,6 +276,7 @@ class Splats {
     this.targets = {};
     this.styles.clear();
     for (const [name, style] of this.colours) this.upload(name, style);
+    for (const [name, { gains }] of this.lights) this.light([name], gains);
     if (this.order) this.put();
   }
 
@@ -333,6 +336,18 @@ class Splats {
       range, rows: this.texture(rows, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE),
       maps: this.texture(padded, gl.RGBA32F, gl.RGBA, gl.FLOAT, padded.length / 4),
     });
+  }
+
+  // Light on the Gaussians of some styles (sun.js): four floats each; null = none.
+  light(names, gains) {
+    const texture = gains && this.texture(gains, this.gl.RGBA32F, this.gl.RGBA, this.gl.FLOAT), before = new Set();
+    for (const name of names) {
+      before.add(this.lights.get(name)?.texture);
+      if (gains) this.lights.set(name, { gains, texture });
+      else this.lights.delete(name);
+    }
+    for (const each of this.lights.values()) before.delete(each.texture);
+    before.forEach((each) => { if (each) this.gl.deleteTexture(each); });
   }
 
   // Order the Gaussians for a camera; `view` is world to camera by columns. One at a time. Of `every` so many neighbours one is
@@ -435,7 +450,8 @@ class Splats {
   splat(target, view, lens, look, near, pixel) {
     const gl = this.gl, { program, places } = this.programs.project;
     const one = this.styles.get(look.first), two = this.styles.get(look.second) ?? one;
-    const { shape, chunks, palette, projected } = this.textures, all = { shape, chunks, palette, first: one.rows, second: two.rows, maps0: one.maps, maps1: two.maps };
+    const { shape, chunks, palette, projected } = this.textures, lights = [look.first, look.second].map((name) => this.lights.get(name));
+    const all = { shape, chunks, palette, first: one.rows, second: two.rows, maps0: one.maps, maps1: two.maps, gains0: lights[0]?.texture ?? one.rows, gains1: lights[1]?.texture ?? one.rows };
     gl.useProgram(program);
     Object.entries(all).forEach(([name, texture], i) => {
       gl.activeTexture(gl.TEXTURE0 + i);
@@ -444,6 +460,8 @@ class Splats {
     });
     gl.uniformMatrix4fv(places.range0, false, one.range);
     gl.uniformMatrix4fv(places.range1, false, two.range);
+    gl.uniform1i(places.lit0, lights[0] ? 1 : 0);
+    gl.uniform1i(places.lit1, lights[1] ? 1 : 0);
     gl.uniformMatrix4fv(places.view, false, view);
     gl.uniform4f(places.lens, ...lens);
     gl.uniform2f(places.size, target.width, target.height);

@@ -1,0 +1,133 @@
+"""Light on Gaussians as the page computes it (`web/sun.js`), by the formulas of `fprf/light/relight.py`.
+
+Bytes of N packed Gaussians:
+
+level    how far a surface faces the sky; of the sky the sine of its height
+open     root of the share of the sky that is open to it, at least 36; 0 = it belongs to the sky
+met      of one light: share of the sun's light that meets it
+
+A light has few numbers beside its bytes: what of the sun, the sky and the ground falls on a surface, each times the
+exposure. Two lights are blended by these numbers and bytes: linear in irradiance.
+"""
+
+import zlib
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..light.config import SunConfig
+from ..light.day import day
+from ..light.relight import (
+    GROUND_ALBEDO,
+    MAX_GAIN,
+    SHOULDER,
+    bounced,
+    exposed,
+    level_share,
+    linear,
+    sky_share,
+    sun_share,
+)
+from ..splats.gaussians import Gaussians
+from ..splats.relighting import MAX_SKY_GAIN, MIN_SKY_COLOUR, Illumination
+
+
+@dataclass(frozen=True, eq=False)
+class PackedLight:
+    """A light; where it has no sun nothing is met."""
+
+    met: Annotated[NDArray[np.uint8], "N"] | None
+    head: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Suns:
+    """Lights of a day on N Gaussians, and that of clouds."""
+
+    surfaces: Annotated[NDArray[np.uint8], "2 N"]
+    head: dict[str, Any]
+    day: tuple[PackedLight, ...]
+    overcast: PackedLight
+
+    def section(self, rows: Annotated[Tensor, "n"], level: int = 9) -> bytes:
+        """Deflated bytes of some Gaussians: level, open, and met of each light that has a sun."""
+        planes = [*self.surfaces, *(light.met for light in self.day if light.met is not None)]
+        chosen = rows.numpy()
+        return zlib.compress(b"".join(plane[chosen].tobytes() for plane in planes), level)
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """What the page has to know to read the section."""
+        return {
+            **self.head,
+            "day": [light.head for light in self.day],
+            "overcast": self.overcast.head,
+        }
+
+
+def packed_surfaces(illumination: Illumination) -> Annotated[NDArray[np.uint8], "2 N"]:
+    """Bytes of all Gaussians, whatever the light: level and open."""
+    received = illumination.received
+    level = torch.where(
+        illumination.sky, illumination.heights.clamp(0, 1), level_share(received, illumination.up)
+    )
+    opened = torch.where(illumination.sky, torch.zeros(()), sky_share(received))
+    return _bytes(torch.stack([level, opened]))
+
+
+def surfaces_header(illumination: Illumination, gaussians: Gaussians) -> dict[str, Any]:
+    """What the page has to know of surfaces, whatever the light."""
+    fit = None
+    if bool(illumination.sky.any()):
+        fit = illumination.captured_sky(gaussians).fit.tolist()
+    return {
+        "ahead": illumination.ahead.tolist(),
+        "fit": fit,
+        "shoulder": SHOULDER,
+        "albedo": GROUND_ALBEDO,
+        "most": MAX_GAIN,
+        "mostSky": MAX_SKY_GAIN,
+        "leastSky": MIN_SKY_COLOUR,
+    }
+
+
+def packed_light(illumination: Illumination, gaussians: Gaussians, config: SunConfig) -> PackedLight:
+    """A light as the page draws it. Its strength is left to the page."""
+    light, sun, received = illumination.under(config)
+    weights = torch.where(illumination.sky, torch.zeros(()), illumination.surfaces.weights)
+    before = linear(gaussians.colours.clamp(0, 1))
+    _, exposure = exposed(received, light, sun, illumination.up, before, weights)
+    level = 1.0
+    if bool(illumination.sky.any()):
+        level = illumination.captured_sky(gaussians).level(light)
+    head = {
+        "sun": (exposure * light.sun).tolist(),
+        "sky": (exposure * light.sky).tolist(),
+        "bounce": (exposure * bounced(light, sun, illumination.up)).tolist(),
+        "horizon": (level * light.horizon).tolist(),
+        "zenith": (level * light.zenith).tolist(),
+    }
+    met = _bytes(sun_share(received, sun)) if bool(light.sun.any()) else None
+    return PackedLight(met, head)
+
+
+def packed_day(illumination: Illumination, gaussians: Gaussians, suns: int, noon: float) -> Suns:
+    """A day with so many suns, of which the highest stands at the azimuth `noon` in degrees."""
+    lights = []
+    for hour in day(suns, noon):
+        light = packed_light(illumination, gaussians, hour.config)
+        place = {"hour": hour.hour, "at": [hour.azimuth, hour.elevation], "met": light.met is not None}
+        lights.append(PackedLight(light.met, {**light.head, **place}))
+    overcast = packed_light(illumination, gaussians, SunConfig(light="overcast"))
+    surfaces = packed_surfaces(illumination)
+    return Suns(surfaces, surfaces_header(illumination, gaussians), tuple(lights), overcast)
+
+
+def _bytes(share: Tensor) -> NDArray[np.uint8]:
+    """Shares in [0, 1] in steps of 1/255."""
+    rounded: NDArray[np.uint8] = (255 * share.clamp(0, 1)).round().to(torch.uint8).numpy()
+    return rounded
