@@ -24,6 +24,7 @@ _LOWEST_SUN_TURN = 80.0
 _DUSK_TURN = 100.0
 """Degrees before and after noon of the blue hours, with the sun 8 degrees below the horizon."""
 _DEGREES_PER_HOUR = 15.0
+"""Of the earth's turn."""
 
 
 def check_suns(count: int) -> None:
