@@ -130,7 +130,7 @@ KNOTS = (
     # A data manager has a store of what an encoder gives.
     "datamanagers.features interfaces",
     "ops.rasterise.gsplat ops.rasterise.training",
-    "page.server page.session page.start",
+    "page.following page.server page.start",
     "style.dictionary style.scene_style",
 )
 """The circles that are no config with what it builds in its own package."""

@@ -92,8 +92,9 @@ def run(args: list[str]) -> int:
     for name in ("SIGTERM", "SIGHUP"):
         if (number := getattr(signal, name, None)) is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
+    from ..page.access import make_access
     from ..page.messages import SHELF
-    from ..page.server import ViewerServer, make_access
+    from ..page.server import ViewerServer
 
     access = make_access(config.host, config.token)
     with contextlib.ExitStack() as stack:
@@ -140,7 +141,7 @@ def run(args: list[str]) -> int:
                 if not (config.follow or begun):
                     session = server.open(opening)
                 if not is_capture(path):
-                    from ..page.session import TrainingFollower
+                    from ..page.following import TrainingFollower
 
                     # A run that is in training: the scene is loaded anew with each checkpoint.
                     TrainingFollower(server, path, opening, session).run(threading.Event())

@@ -4,16 +4,11 @@ else is drawn here.
 A moving camera must see something at once, a camera at rest everything: a new camera gets a small picture,
 then the whole one. What a client's last view holds is kept, so that a slider that is moved while the camera
 rests costs decoding alone.
-
-Films: keyframes that were set on the page become an mp4 in the run's folder. A film's folder holds what `fprf
-render` takes: `path.json` (a camera path), `keys.json` (styles by frame) and the styles with their
-photographs. The film is rendered from these very files, so the same command makes it again, at any size.
 """
 
-import shutil
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -23,26 +18,24 @@ from torch import Tensor
 
 from ..datamanagers.images import load_preview
 from ..errors import UsageError
-from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
 from ..io.maps import match_image, palette
 from ..ops.harmonics import HARMONIC
 from ..rendering.cameras import Cameras, ideal_cameras
-from ..rendering.paths import interpolate, read_camera_path, write_camera_path
 from ..scenes import Scene, SceneView
 from ..splats.scene import SplatScene
 from ..style.config import find_reference, labels, parse_place, parse_region_value
 from ..style.dictionary import Encoders, StyleDictionary, build_dictionary, concatenate, encode_photograph
-from ..style.files import StyleFile, read_keyframes, write_style
+from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.regions import Regions, find_regions, memberships
-from ..style.restyle import Styled, apply_dictionary, keyed_looks
+from ..style.restyle import Styled, apply_dictionary
 from ..style.scene_style import RegionWeight, SceneStyle
-from .messages import Camera, Film, ViewRequest
+from .messages import Camera, ViewRequest
 from .pack import Colours, Packed
 from .render_worker import Steps
-from .state import Look, PageKeyframe, Photograph, RegionAction, RegionInfo, RegionRule, Shown
+from .state import Look, Photograph, RegionAction, RegionInfo, RegionRule, Shown
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -302,7 +295,7 @@ class ScenePainter:
             captured: list[Tensor] = []
             strips: list[SceneView] = []
             # What no look changes is computed once; another look only decodes it again.
-            for strip in kept[1] if kept else _strips(self._scene, cameras_of([request.camera], size)):
+            for strip in kept[1] if kept else strips_of(self._scene, cameras_of([request.camera], size)):
                 rows.append(self._colours(strip, styled, shown))
                 if request.captured:
                     captured.append(strip.restyled().rgb)
@@ -343,7 +336,7 @@ def picture_of(scene: Scene, cameras: Cameras, look: Restyle | None, wipe: float
         whole = scene.restyled(look).render(cameras, 0).rgb
         return to_uint8(wiped(whole, lambda: scene.render(cameras, 0).rgb))
     rows = []
-    for strip in _strips(scene, cameras):
+    for strip in strips_of(scene, cameras):
         rows.append(wiped(strip.restyled(look).rgb, partial(_captured, strip)))
         yield
     return to_uint8(torch.cat(rows))
@@ -380,7 +373,7 @@ def rules_of(restyler: Restyler, file: StyleFile, photographs: Sequence[Photogra
     return frozenset(rules)
 
 
-def _strips(scene: Scene, cameras: Cameras) -> Iterator[SceneView]:
+def strips_of(scene: Scene, cameras: Cameras) -> Iterator[SceneView]:
     """The first view in strips of some rows each, from the top."""
     width, height = cameras.size[0].tolist()
     tall = max(1, STRIP // width)
@@ -421,102 +414,3 @@ def cameras_of(cameras: Sequence[Camera], size: tuple[int, int] | None = None, l
         centre.append([size[0] / 2 + offset[0], size[1] / 2 + offset[1]])
     focals, centres = torch.tensor([focal, centre], dtype=torch.float64)
     return replace(ideal_cameras(torch.stack(poses), 1.0, size), focal=focals, centre=centres)
-
-
-_MAX_FILM_SECONDS = 600.0
-"""Length of a film that is made from the page, at most: `fprf render` makes longer ones."""
-
-
-def film_gap(film: Film) -> int:
-    """Frames from one key to the next."""
-    return max(1, round(film.seconds * film.fps))
-
-
-def film_cameras(keys: Sequence[PageKeyframe], film: Film) -> Cameras:
-    """A camera each frame, of even sizes in the shape of the first key's canvas; a single key is one frame.
-
-    Raises UsageError for no keys or a film that is too long.
-    """
-    if not keys:
-        raise UsageError("film: no keys yet; go somewhere and add one")
-    length = film.seconds * (len(keys) - 1)
-    if length > _MAX_FILM_SECONDS:
-        raise UsageError(f"film: {length:.0f} s; at most {_MAX_FILM_SECONDS:.0f} s are filmed from the page")
-    width, height = keys[0].camera.size
-    by = film.side / max(width, height) / 2
-    size = (max(2, 2 * round(width * by)), max(2, 2 * round(height * by)))
-    cameras = cameras_of([key.camera for key in keys], size)
-    return interpolate(cameras, torch.arange(len(keys)), film_gap(film) - 1)
-
-
-def write_film_files(folder: Path, keys: Sequence[PageKeyframe], film: Film, scene: Scene) -> None:
-    """Write path.json, keys.json, and a folder a look with style.json and its photographs; the folder is
-    made.
-
-    The path is in the capture's coordinates.
-    """
-    cameras = film_cameras(keys, film)  # refused before there is a folder
-    folder.mkdir(parents=True, exist_ok=True)
-    write_camera_path(folder / "path.json", cameras, film.fps, scene.origin)
-    # Keys with equal looks share a style, so that nothing is restyled between them.
-    looks: dict[Look, Path] = {}
-    rows: list[dict[str, object]] = []
-    for i, key in enumerate(keys):
-        if not key.look.plain and key.look not in looks:
-            path = folder / f"style-{len(looks) + 1}" / "style.json"
-            write_style_of(path, key.look, StyleFile(key.look.config(), {}, scene.semantic_encoder))
-            looks[key.look] = path
-        # A key without a look is the scene as captured.
-        style = looks.get(key.look)
-        rows.append(
-            {
-                "frame": i * film_gap(film),
-                "style": None if style is None else str(style.relative_to(folder)),
-            }
-        )
-    write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
-
-
-def write_style_of(path: Path, look: Look, file: StyleFile) -> None:
-    """Write a look as a style.json at `path`, whose folder is made, with copies of its photographs beside it:
-    uploads go with the viewer.
-    """
-    path.parent.mkdir(parents=True)
-    references = []
-    for k, (photograph, _) in enumerate(look.mix):
-        stem = photograph.name.rsplit(".", 1)[0]
-        plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in stem)
-        references.append(path.with_name(f"{k + 1}-{plain or 'photograph'}.png"))
-        shutil.copyfile(photograph.path, references[-1])
-    # References by their number: those of uploads have names of their own.
-    style = file.style
-    rules = {}
-    for field, texts in (("pin", style.pin), ("forbid", style.forbid)):
-        numbered = []
-        for text in texts:
-            region, named = parse_region_value(field, text)
-            numbered.append(f"{region}={find_reference(named, style.references)}")
-        rules[field] = tuple(numbered)
-    style = replace(style, references=tuple(references), pin=rules["pin"], forbid=rules["forbid"])
-    write_style(path, file._replace(style=style))
-
-
-def film_frames(folder: Path, scene: Scene) -> list[Steps[Picture]]:
-    """The frames of a film's folder, each to be rendered step by step."""
-    cameras, _ = read_camera_path(folder / "path.json", scene.origin)
-    looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
-    restyled = lru_cache(maxsize=1)(scene.restyled)  # while a look is held Gaussians are recoloured once
-
-    def rendered(number: int) -> Steps[Picture]:
-        look = looks(number)
-        yield
-        if isinstance(scene, SplatScene):
-            return to_uint8(restyled(look).render(cameras, number).rgb)
-        # A scene that is rendered here may take its time: after each strip a client may come first.
-        rows = []
-        for strip in _strips(scene, cameras.select(torch.tensor([number]))):
-            rows.append(strip.restyled(look).rgb)
-            yield
-        return to_uint8(torch.cat(rows))
-
-    return [rendered(number) for number in range(len(cameras))]

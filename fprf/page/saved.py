@@ -20,6 +20,7 @@ from ..errors import DataError
 from ..io.atomic import write_bytes
 from ..plugins.codec import from_json, to_json
 from ..style.config import StyleConfig
+from ..style.scene_style import SceneStyle
 from .messages import Camera
 from .state import Look, Made, PageKeyframe, Photograph, RegionAction, RegionRule
 
@@ -35,6 +36,19 @@ class Regions(Struct, frozen=True):
     """Centroid of each region's semantic features."""
     mean: tuple[float, ...]
     """Mean of the scene's semantic features."""
+
+
+def regions_now(style: SceneStyle) -> Regions:
+    """The regions of a scene as they are kept."""
+    return Regions(tuple(tuple(row) for row in style.keys.tolist()), tuple(style.semantic_mean.tolist()))
+
+
+def regions_before(regions: Regions, now: SceneStyle) -> SceneStyle | None:
+    """The scene's style with regions that were kept; None where the scene has other semantics now."""
+    keys = now.keys.new_tensor(regions.keys).reshape(len(regions.keys), len(regions.mean))
+    if keys.shape[1] != now.keys.shape[1]:
+        return None
+    return now._replace(keys=keys, semantic_mean=now.semantic_mean.new_tensor(regions.mean))
 
 
 class LookFile(Struct, frozen=True):
@@ -67,6 +81,15 @@ class PageFile(Struct, frozen=True):
     kept: tuple[tuple[str, LookFile], ...] = ()
     keys: tuple[KeyFile, ...] = ()
     regions: Regions | None = None
+
+
+def name_within(root: Path, path: Path) -> str:
+    """The name of a file of Gaussians in a scene's page: by its place in the scene's folder, so that the folder can
+    be renamed.
+    """
+    path = path.resolve()
+    root = root.resolve()
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
 
 def folder_of(root: Path, of: str) -> Path:

@@ -1,57 +1,40 @@
-"""The HTTP server of the viewer: who may connect, the page's requests, and its WebSocket of small messages.
-
-By default this machine alone may connect; from elsewhere a token is needed. A page of another site that is
-open in the same browser can send requests here, so Host must name this machine (DNS rebinding) and Origin
-must be our own page.
-"""
+"""The HTTP server of the viewer: the page's requests, and its WebSocket of small messages."""
 
 import asyncio
 import contextlib
-import hmac
-import ipaddress
 import json
 import logging
-import secrets
 import socket
 import threading
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
-import numpy as np
 import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import HTTPConnection, Request, cookie_parser
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
-from ..io.images import Picture
 from . import EXAMPLES, css, read_asset, script
+from .access import MAX_WAIT_SECONDS, Access, Guard, is_loopback, network_address, qr_code
 from .messages import PictureRequest, StartRequest, read_message
 from .start import Start
 
 if TYPE_CHECKING:
     from .session import Session, Viewed
 
-_MIN_TOKEN_CHARACTERS = 16
-"""Characters of a token that a user chooses, at least; by eye."""
 _MAX_HASH_CHARACTERS = 400
 """Characters of a link behind its #, at most: a view and the name of a style."""
 _ANY_ADDRESS = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
-_MAX_WAIT_SECONDS = 15.0
-"""Time for a request's head, for each further piece of a body, and for each piece of a response to be
-accepted; by eye.
-"""
 _MAX_HEAD_BYTES = 16 << 10
 """Bytes of a request's head; browsers send less than one thousand."""
 _MAX_CONNECTIONS = 64
@@ -64,121 +47,12 @@ _MAX_BODY_BYTES = 20 << 20
 """Bytes of a body: those of a photograph (`uploads.MAX_BYTES`)."""
 _MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
-_MAX_QUERY_FIELDS = 16
-"""Fields of an address; the page sends four."""
-_SENT_BYTES = 1 << 16
-"""Bytes of a piece of a response, which has to be accepted in time."""
 _LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
 """Scripts of the served page, beside those of every page."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src data:; connect-src 'self'; "
     "worker-src blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_HEADERS = {
-    "x-content-type-options": "nosniff",
-    "x-frame-options": "DENY",
-    "referrer-policy": "no-referrer",
-    "cross-origin-opener-policy": "same-origin",
-    "cross-origin-resource-policy": "same-origin",
-    "cache-control": "no-store",
-    "connection": "close",
-}
-
-
-@dataclass(frozen=True)
-class Access:
-    """Checks that a request must pass to be answered."""
-
-    host: str
-    """Address that is listened on."""
-    token: str | None
-    """None = no token is needed."""
-
-    def refusal(self, headers: Mapping[str, str], given: str | None = None) -> str | None:
-        """Return why a request is refused, or None. Header names are lower case; `given` is a token in the
-        address.
-        """
-        # A name that leads here by somebody else's DNS is not one of this machine (rebinding).
-        name = headers.get("host", "")
-        try:
-            host = urlsplit(f"//{name}").hostname or ""
-        except ValueError:
-            host = ""
-        if not name or (is_loopback(self.host) and not is_loopback(host)):
-            return f"this viewer does not go by the name {name!r}; open it by the address that it printed"
-        # Browsers say whose page asks; programs that are no browser say nothing, and have the token alone to
-        # pass.
-        origin = headers.get("origin")
-        if origin is not None and origin not in (f"http://{name}", f"https://{name}"):
-            return "another site may not talk to this viewer"
-        if self.token is None:
-            return None
-        kept = cookie_parser(headers.get("cookie", "")).get(cookie_name(name))
-        # Compared in constant time: how long it takes tells nothing of how much is right.
-        shown = given or kept or headers.get("authorization", "").removeprefix("Bearer ")
-        if hmac.compare_digest(shown.encode(), self.token.encode()):
-            return None
-        return "a token is needed; open the whole address that `fprf view` printed"
-
-
-def cookie_name(host: str) -> str:
-    """Name of the token's cookie under a Host header: with its port, since browsers send cookies to all ports
-    of a host.
-    """
-    port = host.rpartition(":")[2]
-    return f"fprf-token-{port if port.isdecimal() else 80}"
-
-
-def make_access(host: str, token: str | None) -> Access:
-    """Make a token where other machines can connect and none is given. Raises UsageError for one that is
-    easily guessed.
-    """
-    if token is not None and (
-        len(token) < _MIN_TOKEN_CHARACTERS or not token.isascii() or not token.isprintable() or " " in token
-    ):
-        raise UsageError(
-            f"--token: at least {_MIN_TOKEN_CHARACTERS} plain characters without spaces; leave it out and one is made"
-        )
-    if token is None and not is_loopback(host):
-        token = secrets.token_urlsafe(24)
-    return Access(host, token)
-
-
-def network_address(host: str) -> str:
-    """The address by which other machines reach this one, where it listens on all of its own (`host`); without
-    a network that of this machine alone. Nothing is sent to find it.
-    """
-    family = socket.AF_INET
-    elsewhere = "192.0.2.1"  # for documentation (RFC 5737)
-    here = "127.0.0.1"
-    if ":" in host:
-        family = socket.AF_INET6
-        elsewhere = "2001:db8::1"
-        here = "::1"
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect((elsewhere, 9))
-            return str(probe.getsockname()[0])
-        except OSError:
-            return here
-
-
-def qr_code(text: str) -> Picture:
-    """A text as a QR code with its quiet border, a pixel a module."""
-    import cv2
-
-    modules = np.asarray(cv2.QRCodeEncoder.create().encode(text), np.uint8)
-    return np.repeat(np.pad(modules, 1, constant_values=255)[..., None], 3, 2)
-
-
-def is_loopback(host: str) -> bool:
-    """True for a name or address of this machine alone."""
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
 
 
 class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not followed
@@ -186,78 +60,11 @@ class _Protocol(H11Protocol):  # type: ignore[misc]  # uvicorn's types are not f
 
     def connection_made(self, transport: asyncio.Transport) -> None:
         super().connection_made(transport)
-        self.loop.call_later(_MAX_WAIT_SECONDS, self._check_head, transport)
+        self.loop.call_later(MAX_WAIT_SECONDS, self._check_head, transport)
 
     def _check_head(self, transport: asyncio.Transport) -> None:
         if self.cycle is None and transport.get_protocol() is self:
             transport.close()
-
-
-class _GoneError(Exception):
-    """The client has gone or is too slow; no OSError, which is a fault of this machine that the client is
-    told.
-    """
-
-
-class Guard:
-    """Middleware that answers nobody who may not ask, adds headers, and drops clients that do not read."""
-
-    def __init__(self, app: ASGIApp, access: Access) -> None:
-        self._app = app
-        self._access = access
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request or a WebSocket's handshake, and pass it on."""
-        connection = HTTPConnection(scope)
-        given = connection.query_params.get("token")
-        refused = None
-        if any(len(connection.headers.getlist(name)) > 1 for name in ("host", "origin")):
-            refused = (400, "the header host or origin comes twice")
-        elif len(connection.query_params.multi_items()) > _MAX_QUERY_FIELDS:
-            refused = (400, "the address has too many fields")
-        elif (refusal := self._access.refusal(connection.headers, given)) is not None:
-            refused = (403, refusal)
-
-        async def patient(message: Message) -> None:
-            if message["type"].endswith("response.start"):
-                added = []
-                for name, value in _HEADERS.items():
-                    added.append((name.encode(), value.encode()))
-                kept = []
-                for row in message["headers"]:
-                    if row[0].decode().lower() not in _HEADERS:
-                        kept.append(row)
-                message = {**message, "headers": [*kept, *added]}
-            # A body goes in pieces, each of which the client must take in time.
-            body = message.get("body", b"")
-            start = 0
-            try:
-                while len(body) - start > _SENT_BYTES:
-                    piece = {
-                        "type": message["type"],
-                        "body": body[start : start + _SENT_BYTES],
-                        "more_body": True,
-                    }
-                    await asyncio.wait_for(send(piece), _MAX_WAIT_SECONDS)
-                    start += _SENT_BYTES
-                await asyncio.wait_for(
-                    send({**message, "body": body[start:]} if start else message), _MAX_WAIT_SECONDS
-                )
-            except OSError as error:
-                raise _GoneError from error
-
-        with contextlib.suppress(_GoneError):
-            if refused is not None:
-                await PlainTextResponse(f"{refused[1]}\n", refused[0])(scope, receive, patient)
-            elif given is not None and scope["type"] == "http" and scope["method"] == "GET":
-                # Out of the address bar and its history. Lax: a link on another site opens the page too; what
-                # changes anything has an Origin, which is checked.
-                response = RedirectResponse(scope["path"], 303)
-                name = cookie_name(connection.headers.get("host", ""))
-                response.headers["set-cookie"] = f"{name}={given}; Path=/; HttpOnly; SameSite=Lax"
-                await response(scope, receive, patient)
-            else:
-                await self._app(scope, receive, patient)
 
 
 class Client:
@@ -646,7 +453,7 @@ class ViewerServer:
         body = bytearray()
         async with self._uploads:
             try:
-                async with asyncio.timeout(_MAX_WAIT_SECONDS) as patience:
+                async with asyncio.timeout(MAX_WAIT_SECONDS) as patience:
                     size = int(
                         request.headers.get("content-length", "0")
                     )  # digits: the parser refuses others
@@ -656,7 +463,7 @@ class ViewerServer:
                             return bytes(body)
                         body += piece
                         size = max(size, len(body))
-                        patience.reschedule(asyncio.get_running_loop().time() + _MAX_WAIT_SECONDS)
+                        patience.reschedule(asyncio.get_running_loop().time() + MAX_WAIT_SECONDS)
             except TimeoutError:
                 raise HTTPException(408, "the request came too slowly") from None
         raise HTTPException(413, f"more than {_MAX_BODY_BYTES} bytes: make the photograph smaller")

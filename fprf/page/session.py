@@ -11,12 +11,12 @@ import hashlib
 import secrets
 import shutil
 import threading
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -24,37 +24,43 @@ import torch
 from ..errors import DataError, FprfError, UsageError
 from ..io.atomic import write_bytes
 from ..io.images import Picture, encode
-from ..io.video import write_video
 from ..rendering.local_frame import read_offset
 from ..scenes import Scene
-from ..splats.files import Capture, write_capture, write_gaussians
+from ..splats.files import Capture
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig
 from ..style.files import read_style
-from ..training.driver import watch
 from ..training.loading import LoadedRun
 from . import messages
+from .downloads import SAVED_FORMATS, controls_of, write_shown, write_style_of
 from .drawing import (
     Restyler,
     ScenePainter,
     cameras_of,
-    film_frames,
     gaussian_colours,
     matching_regions,
     picture_of,
     rules_of,
-    write_film_files,
-    write_style_of,
 )
+from .films import start_film, write_film_files
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
-from .saved import PageFile, Regions, digest_of, folder_of, made_of, photograph_file, read_page, write_page
+from .saved import (
+    PageFile,
+    Regions,
+    digest_of,
+    folder_of,
+    made_of,
+    name_within,
+    photograph_file,
+    read_page,
+    regions_before,
+    regions_now,
+    write_page,
+)
 from .state import NOW, FilmProgress, History, Look, Made, Photograph, SharedState, Shown, sliders
-from .uploads import Uploads, newest_step, shown_name, training_progress, unpack_style
+from .uploads import Uploads, shown_name, unpack_style
 from .writer import about, packed_scene
-
-if TYPE_CHECKING:
-    from .server import ViewerServer
 
 Post: TypeAlias = Callable[[Hashable | None, str, "Mapping[str, Any] | bytes"], None]
 """Sends a client, or all (None), a message under the name of its kind."""
@@ -62,8 +68,6 @@ _PREVIEW_JPEG_QUALITY = 72
 """Quality of a preview, which is soon replaced; by eye."""
 _FINAL_JPEG_QUALITY = 90
 """Quality of the whole picture; by eye."""
-SAVED_FORMATS = (".ply", ".spz", ".sog", ".glb")
-"""Endings of files of Gaussians that the page saves."""
 _MAX_PREVIEW_BYTES = 1 << 20
 """Bytes of a picture of what a page shows; the page sends some ten thousand."""
 _SAVING_DELAY_SECONDS = 1.0
@@ -129,10 +133,7 @@ class Session:
         self._before: PageFile | None = None
         if viewed.root is not None:
             if viewed.capture is not None:
-                # Within the scene's folder by its place there, so that the folder can be renamed.
-                path = viewed.capture.path.resolve()
-                root = viewed.root.resolve()
-                self._of = str(path.relative_to(root) if path.is_relative_to(root) else path)
+                self._of = name_within(viewed.root, viewed.capture.path)
             self._folder = folder_of(viewed.root, self._of)
             self._before = read_page(self._folder)
 
@@ -182,14 +183,10 @@ class Session:
     def _renumbered(self, made: Made, regions: Regions) -> Made:
         """What was made, with the regions that it speaks of as they are numbered now."""
         now = self.restyler.encoders.scene_style
-        keys = torch.tensor(regions.keys).reshape(len(regions.keys), len(regions.mean))
-        if keys.shape[1] != now.keys.shape[1]:
+        before = regions_before(regions, now)
+        if before is None:
             self.notify("rules for regions were left out: the scene has other semantics now", bad=True)
-            looks = replace(made.look, rules=frozenset())
-            kept = tuple((name, replace(look, rules=frozenset())) for name, look in made.kept)
-            film = tuple(key._replace(look=replace(key.look, rules=frozenset())) for key in made.keys)
-            return replace(made, look=looks, kept=kept, keys=film)
-        before = now._replace(keys=keys, semantic_mean=torch.tensor(regions.mean))
+            return made.without_rules()
         return made.renumbered(matching_regions(before, now).tolist())
 
     def _save_soon(self) -> None:
@@ -212,9 +209,7 @@ class Session:
             return
         regions = None
         if any(look.rules for look in made.looks):
-            style = self.restyler.encoders.scene_style
-            keys = tuple(tuple(row) for row in style.keys.tolist())
-            regions = Regions(keys, tuple(style.semantic_mean.tolist()))
+            regions = regions_now(self.restyler.encoders.scene_style)
         try:
             write_page(folder, made, self._of, regions, self._digests)
         except (FprfError, OSError) as error:
@@ -480,18 +475,7 @@ class Session:
             if share < 1 and before != look:
                 first = scene.restyled(self.restyler.restyle(before)).shown.harmonics
                 gaussians = gaussians.recoloured(torch.lerp(first, gaussians.harmonics, share))
-            # Of a capture all but the colours stays as it was in its file.
-            if viewed.capture is None:
-                write_gaussians(
-                    path,
-                    gaussians,
-                    antialiased=scene.antialiased,
-                    views=scene.views,
-                    plain=True,
-                    origin=scene.origin,
-                )
-            else:
-                write_capture(path, viewed.capture, gaussians.harmonics, scene.views)
+            write_shown(path, scene, viewed.capture, gaussians)
             if any(offset := read_offset(path)):
                 place = " ".join(f"{x:g}" for x in offset)
                 self.notify(f"{suffix} holds positions relative to {place}; .ply holds them as they are")
@@ -539,19 +523,9 @@ class Session:
                     found.append(known)
                 rules = rules_of(self.restyler, file, found)
                 weights = file.style.weights or (1.0,) * len(found)
-                # The look itself holds photographs and rules; what the page has no control for is left out.
-                style = replace(
-                    file.style,
-                    references=(),
-                    weights=(),
-                    masks=(),
-                    pin=(),
-                    forbid=(),
-                    keep=(),
-                    region_strength=(),
-                    between=None,
+                look = Look(
+                    mix=tuple(zip(found, weights, strict=True)), style=controls_of(file.style), rules=rules
                 )
-                look = Look(mix=tuple(zip(found, weights, strict=True)), style=style, rules=rules)
                 self.apply(lambda state: state.taken(look))
                 self._drop_unused(found)
 
@@ -646,29 +620,11 @@ class Session:
             folder = next(each for number in count(1) if not (each := films / f"{number:04d}").exists())
             write_film_files(folder, self.state.keys, film, scene)
             self.apply(lambda state: replace(state, film=FilmProgress(total=1)))
-        path = folder / "film.mp4"
 
         def progress(now: FilmProgress) -> None:
             self.apply(lambda state: replace(state, film=now))
 
-        def rendered(frames: list[Steps[Picture]]) -> Iterator[Picture]:
-            for done, frame in enumerate(frames, 1):
-                yield self._worker.result_when_idle(frame)
-                progress(FilmProgress(done=done, total=len(frames)))
-
-        def work() -> None:
-            try:
-                # Frames are rendered one at a time, as the encoder asks for them.
-                frames = self._worker.result(lambda: film_frames(folder, scene))
-                write_video(path, rendered(frames), film.fps)
-            except Exception as error:  # whatever it is, the next film can be made
-                progress(FilmProgress())
-                self.notify(f"film: {error}", bad=True)
-                return
-            progress(replace(self.state.film, path=path))
-            self.notify(f"film: {path}")
-
-        threading.Thread(target=work, name="fprf-film", daemon=True).start()
+        start_film(folder, scene, film.fps, self._worker, progress, self.notify)
 
     def _on_error(self, error: Exception) -> None:
         expected = isinstance(error, FprfError)
@@ -681,47 +637,3 @@ class Session:
 
 def _colours_message(name: str, version: int) -> dict[str, Any]:
     return {"type": "colours", "name": name, "version": version}
-
-
-_POLL_SECONDS = 0.5
-"""Seconds between looks at a run folder."""
-
-
-class TrainingFollower:
-    """Keeps the scene that a server shows at the newest checkpoint of a run.
-
-    `load` opens the run, and `opened` is the session where it is open already; without, it is opened at the
-    first checkpoint.
-    """
-
-    def __init__(
-        self, server: "ViewerServer", root: Path, load: Callable[[], Viewed], opened: Session | None = None
-    ) -> None:
-        self._server = server
-        self._root = root
-        self._load = load
-        self.session = opened
-        self._shown = -1 if opened is None else opened.viewed.step
-
-    def run(self, ended: threading.Event) -> None:
-        """Follow until the event is set."""
-        while not ended.wait(_POLL_SECONDS):
-            try:
-                self.tick()
-            except (FprfError, OSError) as error:  # the page says so; the next checkpoint may be better
-                self._server.notify(str(error))
-
-    def tick(self) -> None:
-        """Say that somebody looks, and show what is new."""
-        if self._server.pages:
-            watch(self._root)
-        newest = newest_step(self._root)
-        if newest <= self._shown:
-            return
-        self._shown = newest
-        if self.session is None:
-            self.session = self._server.open(self._load, warm=False)
-        else:
-            self.session.reload(self._load())
-        if (progress := training_progress(self._root)) is not None:
-            self.session.trained(progress)

@@ -354,7 +354,7 @@ class Start:
 
     def _train(self, data: Path, run: Path, name: str, minutes: float) -> None:
         """Train a scene; from its first checkpoint on the viewer shows it."""
-        from .session import TrainingFollower
+        from .following import TrainingFollower
 
         load = partial(self._load, run, name)
         ended = threading.Event()

@@ -200,6 +200,12 @@ class Made:
         keys = tuple(key._replace(look=key.look.renumbered(regions)) for key in self.keys)
         return replace(self, look=self.look.renumbered(regions), kept=kept, keys=keys)
 
+    def without_rules(self) -> "Made":
+        """With no rules for regions in any look."""
+        kept = tuple((name, replace(look, rules=frozenset())) for name, look in self.kept)
+        keys = tuple(key._replace(look=replace(key.look, rules=frozenset())) for key in self.keys)
+        return replace(self, look=replace(self.look, rules=frozenset()), kept=kept, keys=keys)
+
 
 class History:
     """What was made before each change, and what was undone. Changes of one control are one step."""

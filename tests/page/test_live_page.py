@@ -23,7 +23,8 @@ from pages import seen
 from splat_ball import ball
 from tiny_world import World, flags
 
-from fprf.page.server import Access, ViewerServer
+from fprf.page.access import Access
+from fprf.page.server import ViewerServer
 from fprf.page.session import Viewed
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import from_tensors

@@ -14,7 +14,8 @@ from pages import seen, written
 from splat_ball import ball
 
 from fprf.page import EXAMPLES
-from fprf.page.server import Access, ViewerServer
+from fprf.page.access import Access
+from fprf.page.server import ViewerServer
 from fprf.page.session import Viewed
 from fprf.page.start import Start
 

@@ -17,16 +17,13 @@ from fprf.cli import main as cli
 from fprf.errors import UsageError
 from fprf.io.images import Picture, to_uint8
 from fprf.io.maps import match_image
-from fprf.page import drawing, messages
-from fprf.page import session as viewer_session
+from fprf.page import drawing, films, messages
 from fprf.page.drawing import (
     Restyler,
     ScenePainter,
-    film_cameras,
-    film_frames,
     matching_regions,
-    write_film_files,
 )
+from fprf.page.films import film_cameras, film_frames, write_film_files
 from fprf.page.session import Session
 from fprf.page.state import Look, Photograph, Shown
 from fprf.style.config import StyleConfig
@@ -142,7 +139,7 @@ def test_another_look_marches_nothing(
     watched.look()
     look = Look(mix=((encoded[0], 1.0),), style=StyleConfig(clusters=2))
     with monkeypatch.context() as patch:
-        patch.setattr(drawing, "_strips", None)
+        patch.setattr(drawing, "strips_of", None)
         found = watched.look(Shown(look), captured=True)
     assert [(kind, final) for kind, _, final in found] == [("look", True), ("captured", True)]
     for (_, picture, _), each in zip(found, (look, Look()), strict=True):
@@ -241,7 +238,7 @@ def test_a_film_that_cannot_be_written_leaves_room_for_the_next(
     scene = session.viewed.scene
     session.apply(lambda state: replace(state, keys=keys_of(scene, [Look()] * 2)))
     with monkeypatch.context() as patch:
-        patch.setattr(viewer_session, "write_video", full)
+        patch.setattr(films, "write_video", full)
         session.handle(1, messages.Film(seconds=1.0, side=64))
         listener.until_said("disk full")
     session.handle(1, messages.Film(seconds=0.2, side=64))

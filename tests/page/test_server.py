@@ -19,8 +19,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from fprf.errors import UsageError
-from fprf.page import EXAMPLES, server
-from fprf.page.server import Access, Client, ViewerServer, cookie_name, make_access, network_address
+from fprf.page import EXAMPLES, access, server
+from fprf.page.access import Access, cookie_name, make_access, network_address
+from fprf.page.server import Client, ViewerServer
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
@@ -99,7 +100,8 @@ class Probe(ViewerServer):
 @pytest.fixture
 def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[ViewerServer]:
     monkeypatch.setattr(server, "_MAX_BODY_BYTES", 100_000)
-    monkeypatch.setattr(server, "_MAX_WAIT_SECONDS", 0.5)
+    for module in (server, access):
+        monkeypatch.setattr(module, "MAX_WAIT_SECONDS", 0.5)
     with Probe(HERE, 0) as found:
         yield found
 

@@ -20,10 +20,12 @@ from tiny_world import World
 from fprf.cli import view
 from fprf.errors import DataError, FprfError, UsageError
 from fprf.page import messages
+from fprf.page.access import Access
+from fprf.page.downloads import SAVED_FORMATS
 from fprf.page.messages import SHELF
 from fprf.page.render_worker import Steps
-from fprf.page.server import Access, ViewerServer
-from fprf.page.session import SAVED_FORMATS, Session, view_of_run
+from fprf.page.server import ViewerServer
+from fprf.page.session import Session, view_of_run
 from fprf.page.state import MAX_UNDONE_PHOTOGRAPHS, SharedState
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.training.loading import open_run

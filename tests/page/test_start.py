@@ -17,9 +17,11 @@ from session_helpers import until
 from fprf.errors import CheckpointError, DataError, FprfError, UsageError
 from fprf.page import EXAMPLES
 from fprf.page import start as start_module
+from fprf.page.access import Access
+from fprf.page.following import TrainingFollower
 from fprf.page.messages import Discard, Leave, Make, New, Open, Remove, Rename, Stop
-from fprf.page.server import Access, ViewerServer
-from fprf.page.session import TrainingFollower, Viewed, view_of_run
+from fprf.page.server import ViewerServer
+from fprf.page.session import Viewed, view_of_run
 from fprf.page.start import Start
 from fprf.page.uploads import training_progress
 from fprf.training.driver import is_watched

@@ -20,7 +20,7 @@ from benchmarks.town.write import write_town
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
-from fprf.page.drawing import write_film_files
+from fprf.page.films import write_film_files
 from fprf.page.messages import Camera, Film
 from fprf.page.state import Look, PageKeyframe
 from fprf.rendering.local_frame import read_offset
