@@ -30,7 +30,7 @@ from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.regions import Regions, find_regions, memberships
-from ..style.restyle import Styled, apply_dictionary
+from ..style.restyle import Styled, apply_dictionary, apply_style
 from ..style.scene_style import RegionWeight, SceneStyle
 from .messages import Camera, ViewRequest
 from .pack import Colours, Packed
@@ -113,6 +113,8 @@ class Restyler:
         def made() -> Styled:
             # Each photograph is clustered once; a mix is their dictionaries side by side under the mix's
             # weights.
+            if not look.painted:
+                return apply_style(self.scene, StyleFile(look.mixed([]).config()), self.encoders)
             style = look.config()
             clusters = style.clusters
             blend = style.blend
@@ -160,7 +162,7 @@ class Restyler:
         """Return the style that a region takes in a look."""
         # A region stands for its points: its key is matched as they are.
         scene = self.encoders.scene_style
-        styled = self.styled(look)
+        styled = self.styled(look.unlit)
         taken: list[tuple[str, float]] = []
         if styled is not None:
             # What the region's key takes of each code, summed by photograph.
@@ -193,8 +195,8 @@ def matching_regions(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "
 
 
 def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, shown: Shown) -> Colours:
-    """Colours of Gaussians for browsers; maps have one colour each."""
-    styled = restyler.styled(shown.look)
+    """Colours of Gaussians in the captured light, for browsers; maps have one colour each."""
+    styled = restyler.styled(shown.look.unlit)
     harmonics = scene.restyled(None if styled is None else styled.restyle).shown.harmonics
     if shown.map == "none" and shown.region is None:
         return packed.colours(harmonics, rounds=2)

@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from ..errors import DataError
+from ..light.config import LightName
 
 SHELF = 12
 """Photographs on the shelf; the oldest that no look needs makes room."""
@@ -56,6 +57,17 @@ class Set(Message, tag="set"):
 
     name: Slider
     value: Number
+
+
+class Sun(Message, tag="sun"):
+    """The light of the look was changed; neither `light` nor `sun` = the captured one."""
+
+    light: LightName | None = None
+    sun: tuple[Annotated[float, Meta(ge=-360, le=360)], Annotated[float, Meta(ge=0.5, le=90)]] | None = None
+    """Azimuth and elevation in degrees."""
+    strength: Share = 1.0
+    moving: bool = False
+    """It is being dragged: it may be shown coarsely."""
 
 
 class Preset(Message, tag="preset"):
@@ -140,7 +152,7 @@ class PictureRequest(Message, tag="picture"):
     """Share of the width, from the left, that is shown as captured; below 0 none."""
 
 
-Change: TypeAlias = Set | Preset | Card | Region | Map | Keep | Key
+Change: TypeAlias = Set | Sun | Preset | Card | Region | Map | Keep | Key
 """Messages that change what all clients see."""
 AnyMessage: TypeAlias = ViewRequest | Pick | Film | Undo | Change
 

@@ -47,7 +47,7 @@ _MAX_BODY_BYTES = 20 << 20
 """Bytes of a body: those of a photograph (`uploads.MAX_BYTES`)."""
 _MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
-_LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "start.js")
+_LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "live_sun.js", "start.js")
 """Scripts of the served page, beside those of every page."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src data:; connect-src 'self'; "
@@ -272,6 +272,8 @@ class ViewerServer:
             WebSocketRoute("/live", self._live),
             Route("/scene", self._scene),
             Route("/colours", self._colours),
+            Route("/surfaces", self._surfaces),
+            Route("/light", self._light),
             Route("/card", self._card),
             Route("/address", self._address),
             Route("/code", self._code),
@@ -338,6 +340,15 @@ class ViewerServer:
 
     async def _scene(self, request: Request) -> Response:
         return Response(self.session.geometry, media_type="application/octet-stream")
+
+    async def _surfaces(self, request: Request) -> Response:
+        return Response(
+            await asyncio.to_thread(self.session.lights.surfaces), media_type="application/octet-stream"
+        )
+
+    async def _light(self, request: Request) -> Response:
+        data = self.session.lights.light(request.query_params.get("name", ""))
+        return Response(data, media_type="application/octet-stream")
 
     async def _colours(self, request: Request) -> Response:
         data = self.session.colours(request.query_params.get("name", ""))

@@ -43,6 +43,7 @@ from .drawing import (
     rules_of,
 )
 from .films import start_film, write_film_files
+from .lighting import Lights
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
 from .saved import (
@@ -122,6 +123,7 @@ class Session:
         self._worker = RenderWorker(self._on_error)
         self._version = count(1)
         self._colours: dict[str, tuple[int, bytes]] = {}
+        self._lights: Lights | None = None
         self._progress: dict[str, Any] | None = None
         self._history = History()
         self._digests: dict[Photograph, str] = {}
@@ -224,6 +226,9 @@ class Session:
             # Shapes and captured colours go to browsers once.
             self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
             self.geometry = container(head, parts)
+            self._lights = Lights(
+                scene, self.packed.order, self._worker, self._post, self.tell, self._version
+            )
         else:
             self._painter = ScenePainter(scene, self.restyler, self._show, self.viewed.pixels)
             # A camera turns about a point as far away as most cameras are from their middle.
@@ -246,6 +251,8 @@ class Session:
         ready = []
         for name, (version, _) in coloured:
             ready.append((f"colours {name}", _colours_message(name, version)))
+        if self._lights is not None:
+            ready.extend(self._lights.hello())
         if self._progress is None:
             training = []
         else:
@@ -292,7 +299,11 @@ class Session:
                     control = message.name
                 if isinstance(message, messages.Card) and message.action == "weight":
                     control = message.card
+                if isinstance(message, messages.Sun):
+                    control = self.lights  # refused where there are none
                 self.apply(lambda state: state.changed(message), control=control)
+                if isinstance(message, messages.Sun):
+                    self._relight(NOW, self.state.shown, moving=message.moving)
 
     def disconnect(self, client: Hashable) -> None:
         """Drop everything of a client."""
@@ -338,8 +349,10 @@ class Session:
             self._worker.run("select", lambda: self._select(region))
         # What is seen is drawn again only where it is another; names and lists of the page cost a message
         # alone.
-        if now.shown != before.shown:
+        if now.shown.unlit != before.shown.unlit:
             self._refresh()
+        if now.shown.light != before.shown.light and control is not self._lights:
+            self._relight(NOW, now.shown)
         if now != before:
             self._post(None, "state", self._described())
 
@@ -350,9 +363,11 @@ class Session:
         known = dict(before.kept)
         for name in known.keys() - dict(now.kept).keys():
             self._worker.run(("kept", name), partial(self._colours.pop, name, None))
+            self._relight(name, Shown(Look()))
         for name, look in now.kept:
             if known.get(name) != look:
                 self._worker.run(("kept", name), partial(self._colour, name, Shown(look)))
+                self._relight(name, Shown(look))
 
     def upload(self, data: bytes, name: str, *, join: bool = False) -> Photograph:
         """Decode and encode a photograph and restyle the scene with it, and with those that it is to `join`.
@@ -432,8 +447,10 @@ class Session:
             for name, look in self.state.kept:
                 if name in coloured:
                     self._worker.run(("kept", name), partial(self._colour, name, Shown(look)))
+                    self._relight(name, Shown(look))
             if NOW in coloured or not self.state.look.plain:
                 self._refresh()
+                self._relight(NOW, self.state.shown)
 
         self._worker.run("reload", job)
 
@@ -449,6 +466,13 @@ class Session:
         if (found := self._colours.get(name)) is None:
             raise UsageError(f"{name}: no such colours")
         return found[1]
+
+    @property
+    def lights(self) -> Lights:
+        """Lights of looks, for browsers. Raises UsageError where there are no Gaussians."""
+        if self._lights is None:
+            raise UsageError("light falls on Gaussians; `fprf export` makes some of a field")
+        return self._lights
 
     def gaussians(self, shown: str, start: str, share: float, suffix: str) -> Path:
         """The Gaussians as they are shown, in a file: in the look `shown`, or so far on the way to it from the
@@ -601,6 +625,13 @@ class Session:
             container(colour_header(colours), {"rows": colour_section(colours, 1)}),
         )
         self._post(None, f"colours {name}", _colours_message(name, version))
+
+    def _relight(self, name: str, shown: Shown, *, moving: bool = False) -> None:
+        """Light Gaussians in browsers, of what is shown now or of a look that is kept."""
+        if self._lights is not None:
+            if name == NOW and NOW not in self._colours:
+                self._refresh()
+            self._lights.relight(name, shown.light, moving=moving)
 
     def _select(self, region: int | None) -> None:
         picked = None

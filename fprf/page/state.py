@@ -6,7 +6,7 @@ style in the terms of `style.json`.
 """
 
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -16,10 +16,12 @@ import msgspec
 from ..errors import UsageError
 from ..io.images import Picture
 from ..io.maps import palette
+from ..light.config import SunConfig
 from ..plugins import slots
 from ..plugins.slots import hints_of
 from ..style.config import StyleConfig, with_preset
 from ..style.dictionary import Reference
+from ..style.restyle import sun_of
 from . import messages
 from .messages import SHELF, Camera
 from .writer import CAPTURED
@@ -83,7 +85,21 @@ class Look:
     @property
     def plain(self) -> bool:
         """True for the scene as it was captured."""
-        return not self.mix or self.style.strength == 0
+        return not self.painted and not self.style.lit
+
+    @property
+    def painted(self) -> bool:
+        """Photographs change its colours."""
+        return bool(self.mix) and self.style.strength > 0
+
+    @property
+    def unlit(self) -> "Look":
+        """The look in the captured light."""
+        own = StyleConfig()
+        style = self.style
+        for each in fields(SunConfig):
+            style = slots.replace(style, each.name, getattr(own, each.name))
+        return replace(self, style=style)
 
     def mixed(self, mix: Iterable[tuple[Photograph, float]]) -> "Look":
         """The look with other photographs; rules that name a photograph that is not among them go."""
@@ -170,6 +186,18 @@ class Shown(NamedTuple):
     map: MapKind = "none"
     region: int | None = None
     """A region to be highlighted; the others are dimmed."""
+
+    @property
+    def unlit(self) -> "Shown":
+        """The same in the captured light."""
+        return self._replace(look=self.look.unlit)
+
+    @property
+    def light(self) -> SunConfig | None:
+        """The light that falls on it; None = the captured one. Maps are not lit."""
+        if self.map != "none" or self.region is not None:
+            return None
+        return sun_of(self.look.style)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,7 +335,7 @@ class SharedState(Made):
         for each in self.shelf:
             if each not in shelf:
                 shelf.append(each)
-        look = self.look if self.look.mix else saved.look
+        look = saved.look if self.look.plain else self.look
         state = self.remade(
             Made(
                 shelf=tuple(shelf),
@@ -339,7 +367,7 @@ class SharedState(Made):
         if name == NOW:
             return self.look
         if name == CAPTURED:
-            return Look(style=self.look.style)
+            return Look(style=self.look.unlit.style)
         kept = dict(self.kept)
         if name not in kept:
             raise UsageError(f"{name}: no look is called so")
@@ -399,6 +427,10 @@ class SharedState(Made):
                 whole = hints_of(type(getattr(look.style, slot[0]) if slot else look.style))[name] is int
                 value: Any = int(message.value) if whole else round(message.value, 4)
                 return replace(self, look=replace(look, style=slots.replace(look.style, message.name, value)))
+            case messages.Sun():
+                strength = round(message.strength, 4)
+                style = replace(look.style, light=message.light, sun=message.sun, sun_strength=strength)
+                return replace(self, look=replace(look, style=style))
             case messages.Preset():
                 return replace(self, look=replace(look, style=with_preset(look.style, message.name)))
             case messages.Map():
@@ -495,10 +527,12 @@ class SharedState(Made):
             card = {"card": each.number, "name": each.name, "weight": weight, "colour": colours.get(each)}
             shelf.append(card)
         film = self.film
+        style = self.look.style
         return {
             "type": "state",
             "shelf": shelf,
             "look": sliders(self.look.style),
+            "sun": {"light": style.light, "sun": style.sun, "strength": style.sun_strength},
             "map": self.map,
             "picked": region,
             "kept": [name for name, _ in self.kept],

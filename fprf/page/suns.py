@@ -33,7 +33,7 @@ from ..light.relight import (
     sun_share,
 )
 from ..splats.gaussians import Gaussians
-from ..splats.relighting import MAX_SKY_GAIN, MIN_SKY_COLOUR, Illumination
+from ..splats.relighting import MAX_SKY_GAIN, MIN_SKY_COLOUR, Illumination, Reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,23 +95,30 @@ def surfaces_header(illumination: Illumination, gaussians: Gaussians) -> dict[st
     }
 
 
-def packed_light(illumination: Illumination, gaussians: Gaussians, config: SunConfig) -> PackedLight:
-    """A light as the page draws it. Its strength is left to the page."""
-    light, sun, received = illumination.under(config)
+def packed_light(
+    illumination: Illumination, gaussians: Gaussians, config: SunConfig, reach: Reach | None = None
+) -> PackedLight:
+    """A light as the page draws it; `reach` takes the place of `illumination.reach`. Its strength is left to the
+    page.
+    """
+    light, sun, received = illumination.under(config, reach)
     weights = torch.where(illumination.sky, torch.zeros(()), illumination.surfaces.weights)
     before = linear(gaussians.colours.clamp(0, 1))
     _, exposure = exposed(received, light, sun, illumination.up, before, weights)
     level = 1.0
     if bool(illumination.sky.any()):
         level = illumination.captured_sky(gaussians).level(light)
-    head = {
+    head: dict[str, Any] = {
         "sun": (exposure * light.sun).tolist(),
         "sky": (exposure * light.sky).tolist(),
         "bounce": (exposure * bounced(light, sun, illumination.up)).tolist(),
         "horizon": (level * light.horizon).tolist(),
         "zenith": (level * light.zenith).tolist(),
     }
-    met = _bytes(sun_share(received, sun)) if bool(light.sun.any()) else None
+    met = None
+    if bool(light.sun.any()):
+        met = _bytes(sun_share(received, sun))
+        head["at"] = illumination.degrees_of(sun)
     return PackedLight(met, head)
 
 

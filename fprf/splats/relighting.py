@@ -1,9 +1,9 @@
 """Another light on Gaussians: what is found out about them once, and their colours under a sun and a sky."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -98,6 +98,12 @@ class Illumination:
         sun: Tensor = math.cos(rise) * level + math.sin(rise) * self.up
         return sun
 
+    def degrees_of(self, sun: Annotated[Tensor, "3"]) -> tuple[float, float]:
+        """Azimuth in [-180, 180] and elevation of a unit vector, as `sun_direction` takes them."""
+        right = torch.linalg.cross(self.ahead, self.up)
+        azimuth = math.degrees(math.atan2(float(sun @ right), float(sun @ self.ahead)))
+        return azimuth, math.degrees(math.asin(max(-1.0, min(1.0, float(sun @ self.up)))))
+
     def reach(self, sun: Annotated[Tensor, "3"], degrees: float = 0.0) -> Annotated[Tensor, "N"]:
         """Share of the light of a sun of so many degrees that reaches each Gaussian, in [0, 1]."""
         points = self.points
@@ -116,13 +122,17 @@ class Illumination:
         none = torch.zeros(len(self.far))
         return Received(self.surfaces.normals, self.surfaces.sure, self.openness, none)
 
-    def under(self, config: SunConfig) -> tuple[Light, Annotated[Tensor, "3"], Received]:
-        """A light, the unit vector to its sun, and what all Gaussians receive."""
+    def under(
+        self, config: SunConfig, reach: "Reach | None" = None
+    ) -> tuple[Light, Annotated[Tensor, "3"], Received]:
+        """A light, the unit vector to its sun, and what all Gaussians receive; `reach` takes the place of that of
+        this illumination.
+        """
         light, azimuth = light_of(config)
         sun = self.sun_direction(azimuth, light.elevation)
         received = self.received
         if bool(light.sun.any()):
-            received = received._replace(reach=self.reach(sun, config.sun_size))
+            received = received._replace(reach=(reach or self.reach)(sun, config.sun_size))
         return light, sun, received
 
     def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
@@ -157,6 +167,10 @@ class Illumination:
         return found._replace(brightness=float((mean * weight).sum() / (3 * weight.sum())))
 
 
+Reach: TypeAlias = Callable[[Annotated[Tensor, "3"], float], Annotated[Tensor, "N"]]
+"""Share of a sun's light that reaches each Gaussian, by its direction and its degrees."""
+
+
 class CapturedSky(NamedTuple):
     """The sky as captured, in linear light."""
 
@@ -178,6 +192,26 @@ class CapturedSky(NamedTuple):
 
 _CLEAR_SKY_SHARE = 0.55
 """Brightness of a clear sky over that of clouds, in pictures that are exposed for what is lit (by eye)."""
+
+
+def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int) -> Illumination:
+    """What is known of some rows, of every so many neighbours one, as much larger where they cast shadows."""
+    kept = illumination
+    # Rows of the blockers, which are those that are not far.
+    place = (~kept.far).cumsum(0) - 1
+    some = place[rows[~kept.far[rows]]]
+    means, covariances, opacities = kept.blockers
+    blockers = Blockers(means[some], every * covariances[some], opacities[some])
+    surfaces = Surfaces(*(part[rows] for part in kept.surfaces))
+    return replace(
+        kept,
+        surfaces=surfaces,
+        blockers=blockers,
+        openness=kept.openness[rows],
+        far=kept.far[rows],
+        sky=kept.sky[rows],
+        heights=kept.heights[rows],
+    )
 
 
 @torch.inference_mode()

@@ -223,7 +223,7 @@ class Live {
       if (this.state) this.panel.fill(this.state);
       return;
     }
-    if (["set", "preset", "card", "map", "region", "undo"].includes(type)) this.changed = true;
+    if (["set", "preset", "card", "map", "region", "undo", "sun"].includes(type)) this.changed = true;
     this.socket.send(JSON.stringify({ type, ...more }));
   }
 
@@ -245,9 +245,14 @@ class Live {
       case "scene": await this.open(message); break;
       case "training": this.trained(message); break;
       case "colours": await this.recolour(message); break;
+      case "light":
+        await this.sun.relight(message);
+        if (message.name === "Now" && message.version !== null) this.thrust("Now");
+        break;
       case "state":
         this.state = message;
         this.panel.fill(message);
+        this.sun?.fill(message.sun);
         break;
     }
   }
@@ -344,6 +349,8 @@ class Live {
       this.stage.add({ name: "Now" });
       this.stage.choose("Now");
     }
+    if (this.scene.gaussians) this.sun = new LiveSun(this);
+    this.stage.listeners.unfolded = (id) => { if (id === "light" && !at("lighting").hidden) this.sun?.open(); };
     this.stage.listeners.escape = () => {
       if (this.state?.picked) this.tell("region", { action: "close" });
     };
@@ -395,12 +402,16 @@ class Live {
       await this.place.splats.add(name, head, parts.rows);
     }
     this.place.touch(false);
-    const { styles, from, to, wiping, amount } = this.stage;
-    const fresh = !styles.some((style) => style.name === name);
+    const fresh = !this.stage.styles.some((style) => style.name === name);
     this.stage.add({ name });
     if (fresh && this.stage.sending.asked === name) this.stage.choose(name);
-    if (name !== "Now") return;
-    // What was changed here is seen here; what others change is not thrust upon this page.
+    if (name === "Now") this.thrust(name, fresh);
+  }
+
+  /** What was changed here is seen here; what others change is not thrust upon this page. */
+  thrust(name, fresh = false) {
+    const { styles, from, to, wiping, amount } = this.stage;
+    if (!styles.some((style) => style.name === name)) return; // its colours come later
     const compared = from === name && (wiping || amount < 1);
     if (fresh || (this.changed && to !== name && !compared)) this.stage.choose(name);
     this.changed = false;

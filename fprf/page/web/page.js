@@ -177,6 +177,7 @@ class Stage {
     }
     this.sending.fill();
     this.seeing?.fill();
+    this.listeners.unfolded?.(id);
   }
 
   key(event) {
