@@ -212,9 +212,14 @@ def test_newer_states_of_a_training_are_shown_as_they_come(
         """Show a newer state, whose colours come anew."""
         count = len(listener.sent)
         splats.reload(replace(splats.viewed, **changes))
-        listener.until(
-            lambda: {f"colours {name}" for name in names} <= {kind for _, kind, _ in listener.sent[count:]}
-        )
+
+        def came() -> bool:
+            # Colours of the state before may still have been under way.
+            kinds = [kind for _, kind, _ in listener.sent[count:]]
+            after = kinds[kinds.index("scene") :] if "scene" in kinds else []
+            return {f"colours {name}" for name in names} <= {*after}
+
+        listener.until(came)
 
     splats.upload(world.references[0].read_bytes(), "dusk.png")
     splats.handle(1, messages.Keep(name="dark", action="keep"))
