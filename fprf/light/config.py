@@ -45,7 +45,8 @@ class SunConfig:
     """
     sun: tuple[float, float] | None = None
     """AZIMUTH ELEVATION of the sun in degrees: clockwise from the direction of the first view, in [-360, 360],
-    and above the horizon, in (0, 90]. none = as the light says, if there is one.
+    and above the horizon, in [0.5, 90]. none = at the height of `light`, on the side from which most of what the
+    views show is lit.
     """
     sun_strength: float = 1.0
     """How far this light takes the place of the captured one, in [0, 1]: at 0 colours stay bit for bit."""

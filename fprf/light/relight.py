@@ -11,8 +11,9 @@ linear sRGB of a Gaussian's mean colour and a shoulder s,
 
     x = y / (1 - s y),    x' = e (E / E0) x,    y' = x' / (1 + s x'),
 
-e being the factor that keeps the mean brightness of what is lit. The map of a Gaussian's colours from every
-direction is the one that takes its mean colour there: affine, and so exact on harmonics,
+e being the factor that keeps the mean brightness of all but the sky, as a camera meters it. The map of a
+Gaussian's colours from every direction is the one that takes its mean colour there: affine, and so exact on
+harmonics,
 
     c' = k (c + 0.055) - 0.055,    k = (c'_mean + 0.055) / (c_mean + 0.055).
 """
@@ -58,12 +59,12 @@ class Received(NamedTuple):
 
 def irradiance(
     received: Received, light: Light, sun: Annotated[Tensor, "3"], up: Annotated[Tensor, "3"]
-) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
-    """Light on surfaces, and the share of the sun's that meets them; `sun` and `up` are unit vectors."""
+) -> Annotated[Tensor, "N 3"]:
+    """Light on surfaces; `sun` and `up` are unit vectors."""
     level = level_share(received, up)
     meets = sun_share(received, sun)
     sky = level[:, None] * light.sky + (1 - level)[:, None] * bounced(light, sun, up)
-    return meets[:, None] * light.sun + sky_share(received)[:, None] * sky, meets
+    return meets[:, None] * light.sun + sky_share(received)[:, None] * sky
 
 
 def captured_irradiance(received: Received, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "N 3"]:
@@ -102,9 +103,7 @@ def gains(
     colours: Annotated[Tensor, "N 3"],
     weights: Annotated[Tensor, "N"],
 ) -> Annotated[Tensor, "N 3"]:
-    """k of each Gaussian, at a brightness that keeps the mean luma of what is lit; `weights` say how much of
-    each is seen.
-    """
+    """k of each Gaussian, at a brightness that keeps the mean luma; `weights` say how much of each is seen."""
     before = linear(colours.clamp(0, 1))
     ratio, exposure = exposed(received, light, sun, up, before, weights)
     after = encoded(_compressed(before, exposure * ratio))
@@ -120,13 +119,10 @@ def exposed(
     before: Annotated[Tensor, "N 3"],
     weights: Annotated[Tensor, "N"],
 ) -> tuple[Annotated[Tensor, "N 3"], float]:
-    """E / E0 above, and the exposure e: the mean luma of what is lit of the linear colours `before` stays, or
-    becomes the light's share of it.
+    """E / E0 above, and the exposure e: the mean luma of the linear colours `before` stays, or becomes the
+    light's share of it.
     """
-    new, meets = irradiance(received, light, sun, up)
-    ratio = new / captured_irradiance(received, up)
-    if bool(light.sun.any()):
-        weights = weights * meets
+    ratio = irradiance(received, light, sun, up) / captured_irradiance(received, up)
     return ratio, _exposure(before, ratio, weights, light.brightness)
 
 

@@ -2,9 +2,10 @@
 
 Illuminances are those of the Illuminating Engineering Society's recommended practice for the calculation of
 daylight availability (1984, doi 10.1080/00994480.1984.10748791), with the sun's height h: on a plane that faces
-the sun E = 127.5 exp(-0.21 / sin h) klx, from the clear sky on a level plane 0.8 + 15.5 sin(h)^0.5 klx, under
-clouds 0.3 + 21 sin(h) klx. The sun's colour is a black body's of 5778 K behind Rayleigh's and aerosol extinction
-of the air mass (Preetham et al. 1999, appendix, turbidity 2.5).
+the sun E = 127.5 exp(-0.21 / sin h) klx; on a level plane from each half of the clear sky 8.2 sin(h)^0.5 klx, but
+for a term that the halves have of opposite signs, from each half of an overcast one 10.7 sin(h) klx. The sun's
+colour is a black body's of 5778 K behind the extinction of Preetham et al. (1999, appendix 1), with turbidity 2.5:
+Rayleigh's 0.008735 w^-4.08, aerosol's (0.04608 turbidity - 0.04586) w^-1.3, ozone's 0.35 cm, w in micrometres.
 """
 
 import math
@@ -17,14 +18,16 @@ from .config import Colour, SunConfig, parse_light_colour
 
 _WAVELENGTHS = (0.61, 0.55, 0.465)
 """Micrometres that red, green and blue stand for."""
+_OZONE = (0.120, 0.085, 0.008)
+"""Absorption of ozone there, a cm."""
 _SUN_KELVIN = 5778.0
 """Of the sun above the air."""
 _TURBIDITY = 2.5
 """Of clear air, as in Preetham's."""
 _CLEAR_KELVIN = 12000.0
 """Of the light of a clear sky, with the sun high (CIE daylight: 10 000 to 25 000)."""
-_LOW_CLEAR_KELVIN = 9000.0
-"""With the sun at the horizon, whose glow is a part of it (by eye)."""
+_LOW_CLEAR_KELVIN = 6500.0
+"""With the sun at the horizon, whose glow is a part of it; cameras balance blue shade away (by eye)."""
 _DUSK_KELVIN = 18000.0
 """Of the sky with the sun below the horizon, blue by ozone (by eye, within the CIE's range)."""
 _MOON_KELVIN = 11000.0
@@ -74,29 +77,31 @@ def sun_colour(elevation: float) -> Annotated[Tensor, "3"]:
     mass = 1 / (math.sin(math.radians(elevation)) + 0.15 * (elevation + 3.885) ** -1.253)
     beta = 0.04608 * _TURBIDITY - 0.04586
     parts = []
-    for wavelength in _WAVELENGTHS:
-        rayleigh = math.exp(-0.008735 * wavelength**-4.08 * mass)
-        parts.append(rayleigh * math.exp(-beta * wavelength**-1.3 * mass))
+    for wavelength, ozone in zip(_WAVELENGTHS, _OZONE, strict=True):
+        extinction = 0.008735 * wavelength**-4.08 + beta * wavelength**-1.3 + 0.35 * ozone
+        parts.append(math.exp(-extinction * mass))
     return _white(kelvin_colour(_SUN_KELVIN) * torch.tensor(parts))
 
 
-def light_of(config: SunConfig) -> tuple[Light, float]:
-    """The light of flags, and the sun's azimuth in degrees."""
-    azimuth, elevation = _USUAL_SUNS[config.light] if config.light is not None else (0.0, 0.0)
+def light_of(config: SunConfig) -> Light:
+    """The light of flags."""
+    elevation = 0.0
     if config.sun is not None:
-        azimuth, elevation = config.sun
+        elevation = config.sun[1]
+    elif config.light is not None:
+        elevation = _USUAL_ELEVATIONS[config.light]
     sine = math.sin(math.radians(max(elevation, 0.5)))
     high = min(sine / math.sin(math.radians(30.0)), 1.0)
     sun = 127.5 * math.exp(-0.21 / sine) * sun_colour(max(elevation, 0.5))
     clear = _LOW_CLEAR_KELVIN + (_CLEAR_KELVIN - _LOW_CLEAR_KELVIN) * high
-    sky = (0.8 + 15.5 * sine**0.5) * kelvin_colour(clear)
+    sky = 2 * 8.2 * sine**0.5 * kelvin_colour(clear)
     zenith = 0.8 * kelvin_colour(_DUSK_KELVIN)
     # Near a low sun's height the sky takes its colour.
     horizon = 1.2 * _white(torch.lerp(sun_colour(max(elevation, 2.0)), kelvin_colour(7500.0), high))
     brightness = 1.0
     if config.light == "overcast":
         sun = torch.zeros(3)
-        sky = (0.3 + 21 * sine) * torch.ones(3)
+        sky = 2 * 10.7 * sine * torch.ones(3)
         zenith = 1.1 * torch.ones(3)
         horizon = 0.9 * torch.ones(3)
     elif config.light == "blue-hour":
@@ -114,17 +119,17 @@ def light_of(config: SunConfig) -> tuple[Light, float]:
         sun = _chosen("sun_colour", config.sun_colour) * _luma(sun)
     if config.sky_colour is not None:
         sky = _chosen("sky_colour", config.sky_colour) * _luma(sky)
-    return Light(sun, sky, horizon, zenith, brightness, elevation), azimuth
+    return Light(sun, sky, horizon, zenith, brightness, elevation)
 
 
-_USUAL_SUNS = {
-    "noon": (40.0, 55.0),
-    "golden-hour": (60.0, 8.0),
-    "blue-hour": (60.0, 0.0),
-    "overcast": (0.0, 45.0),
-    "moonlight": (-60.0, 40.0),
+_USUAL_ELEVATIONS = {
+    "noon": 55.0,
+    "golden-hour": 8.0,
+    "blue-hour": 0.0,
+    "overcast": 45.0,
+    "moonlight": 40.0,
 }
-"""Azimuth and elevation of each light, where no sun is given."""
+"""Degrees of the sun of each light above the horizon, where no sun is given."""
 _LUMA = torch.tensor([0.2126, 0.7152, 0.0722])
 """Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 

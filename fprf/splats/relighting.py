@@ -3,13 +3,15 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
 from ..light.config import SunConfig
-from ..light.relight import LINEAR_OFFSET, Received, affine_change, gains
+from ..light.relight import LINEAR_OFFSET, Received, affine_change, gains, sun_share
+from ..light.skies import MIN_SKY_HEIGHT, sky_pixels
 from ..light.sky import Light, light_of
 from ..light.surfaces import Surfaces, find_surfaces
 from ..light.transport import (
@@ -21,7 +23,9 @@ from ..light.transport import (
     transport,
 )
 from ..ops.harmonics import recoloured
+from ..ops.rasterise.rendering import Pinhole, lift
 from ..rendering.cameras import Cameras
+from .drawing import draw
 from .gaussians import Gaussians, bulk_of
 from .pinholes import covering
 from .restyle import all_around
@@ -38,6 +42,10 @@ _OFFSET_SHARE = 0.008
 """Distance of what casts shadows on a point from it, at least, as a share of the width of the views there: nearer
 ones are the surface itself. On the town 0.2 to 0.8 m do alike at 15 m.
 """
+_MAX_SPREAD_SHARE = 0.2
+"""Distance of a Gaussian from its surface that counts for how thick that is, at most, as a share of that width."""
+_MIN_SHOWN_PIXELS = 1e-2
+"""Weight of a Gaussian in all views, from which on they say something about it."""
 _LIFT_SHARE = 0.4
 """Of that distance, by which points are moved out along their normals."""
 _BLUR_SHARE = 0.0008
@@ -48,8 +56,14 @@ _SUN_PLACES = 4
 """Places on the disc of a sun that is larger than a degree: each takes as long as a small sun."""
 _MAX_HARD_DEGREES = 1.0
 """Diameter up to which a sun is one place: its shadows are blurred by a sixtieth of their distance at most."""
-_MIN_SKY_HEIGHT = 0.02
-"""Sine of the height above the middle of the cameras from which on what is far is sky (by eye)."""
+_AZIMUTHS = 8
+"""Places around that are tried for a sun that nobody has placed."""
+_TRIED_ELEVATION = 20.0
+"""Degrees above the horizon at which they are tried: between golden hour and noon."""
+_TRIED_GAUSSIANS = 8192
+"""Gaussians that they are tried on, about."""
+_MIN_LIKENESS = 0.6
+"""How far pixels of a Gaussian look like the sky where it is the sky, at least (by eye)."""
 MIN_SKY_COLOUR = 0.02
 """Linear light that a captured sky has at least."""
 MAX_SKY_GAIN = 4.0
@@ -62,6 +76,8 @@ class Illumination:
 
     surfaces: Surfaces
     blockers: Blockers
+    spread: Annotated[Tensor, "N"]
+    """How thick the surface is: distance from it of what is seen with it."""
     openness: Annotated[Tensor, "N"]
     far: Annotated[Tensor, "N"]
     """Gaussians that neither cast shadows nor lie in them, bool."""
@@ -76,13 +92,13 @@ class Illumination:
     @property
     def points(self) -> Annotated[Tensor, "N 3"]:
         """Points just above the surfaces."""
-        away = _LIFT_SHARE * self.offset
+        away = _LIFT_SHARE * _OFFSET_SHARE * self.surfaces.widths
         return self.surfaces.points + away[:, None] * self.surfaces.normals
 
     @property
     def offset(self) -> Annotated[Tensor, "N"]:
         """Distance up to which what takes light away is the surface itself."""
-        return _OFFSET_SHARE * self.surfaces.widths
+        return torch.maximum(_OFFSET_SHARE * self.surfaces.widths, self.spread)
 
     @property
     def blur(self) -> float:
@@ -116,6 +132,26 @@ class Illumination:
             found += transport(self.blockers, points, frame_of(place, self.up), offset, offset, self.blur)
         return torch.where(self.far, torch.ones(()), found / len(places))
 
+    @cached_property
+    def azimuth(self) -> float:
+        """Degrees clockwise from the first view's direction from which a sun lights most of what the views show."""
+        some = slice(None, None, max(1, len(self.far) // _TRIED_GAUSSIANS))
+        surfaces = Surfaces(*(part[some] for part in self.surfaces))
+        weights = torch.where(self.far[some], torch.zeros(()), surfaces.weights)
+        points = self.points[some]
+        offset = self.offset[some]
+        best = 0.0
+        most = -1.0
+        for azimuth in [k * 360.0 / _AZIMUTHS for k in range(_AZIMUTHS)]:
+            sun = self.sun_direction(azimuth, _TRIED_ELEVATION)
+            reach = transport(self.blockers, points, frame_of(sun, self.up), offset, offset, self.blur)
+            received = Received(surfaces.normals, surfaces.sure, self.openness[some], reach)
+            lit = float(sun_share(received, sun) @ weights)
+            if lit > most:
+                best = azimuth
+                most = lit
+        return best
+
     @property
     def received(self) -> Received:
         """What all Gaussians receive, but for the sun."""
@@ -128,7 +164,12 @@ class Illumination:
         """A light, the unit vector to its sun, and what all Gaussians receive; `reach` takes the place of that of
         this illumination.
         """
-        light, azimuth = light_of(config)
+        light = light_of(config)
+        azimuth = 0.0
+        if config.sun is not None:
+            azimuth = config.sun[0]
+        elif bool(light.sun.any()):
+            azimuth = self.azimuth
         sun = self.sun_direction(azimuth, light.elevation)
         received = self.received
         if bool(light.sun.any()):
@@ -190,8 +231,8 @@ class CapturedSky(NamedTuple):
         return level
 
 
-_CLEAR_SKY_SHARE = 0.55
-"""Brightness of a clear sky over that of clouds, in pictures that are exposed for what is lit (by eye)."""
+_CLEAR_SKY_SHARE = 0.75
+"""Brightness of a clear sky over that of clouds, in pictures (by eye)."""
 
 
 def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int) -> Illumination:
@@ -207,6 +248,7 @@ def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int
         kept,
         surfaces=surfaces,
         blockers=blockers,
+        spread=kept.spread[rows],
         openness=kept.openness[rows],
         far=kept.far[rows],
         sky=kept.sky[rows],
@@ -229,22 +271,53 @@ def find_illumination(
     far = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart > _MAX_BLOCKER_DISTANCE)
     eyes = cameras.pose[:, :, 3].float().mean(0)
     heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ up
+    sky = far & (heights > MIN_SKY_HEIGHT)
+    shares, spread = _seen_again(gaussians, surfaces, far, sky, pinholes, up, antialiased)
+    sky = sky | ((shares > _MIN_LIKENESS) & (heights > MIN_SKY_HEIGHT))
+    far = far | sky
     covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
     blockers = Blockers(gaussians.means[~far], covariances[~far], gaussians.opacities[~far])
     found = Illumination(
         surfaces,
         blockers,
+        spread,
         torch.ones(len(gaussians)),
         far,
-        far & (heights > _MIN_SKY_HEIGHT),
+        sky,
         heights,
         up,
         ahead,
     )
     open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
-    return Illumination(
-        surfaces, blockers, torch.where(far, torch.ones(()), open_), far, found.sky, heights, up, ahead
-    )
+    return replace(found, openness=torch.where(far, torch.ones(()), open_))
+
+
+def _seen_again(
+    gaussians: Gaussians,
+    surfaces: Surfaces,
+    far: Annotated[Tensor, "N"],
+    sky: Annotated[Tensor, "N"],
+    cameras: Sequence[Pinhole],
+    up: Annotated[Tensor, "3"],
+    antialiased: bool,
+) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
+    """How far the pixels that show a Gaussian look like the sky, in [0, 1], and how thick the surface is there:
+    the mean distance of what they show from it.
+    """
+    shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
+    away = ((surfaces.points - gaussians.means) * surfaces.normals).sum(1).abs()
+    away = torch.minimum(away, _MAX_SPREAD_SHARE * surfaces.widths)
+    values = torch.stack([sky.float(), torch.where(far, torch.zeros(()), away)], 1)
+    sums = torch.zeros(len(gaussians), 3)
+    for camera in cameras:
+        drawn = draw(gaussians, camera, antialiased=antialiased, features=values)
+        inside = drawn.features / drawn.opacity.clamp_min(1e-3)[..., None]
+        sure = torch.where(drawn.opacity > 0.5, inside[..., 0], torch.zeros(()))
+        like = sky_pixels(drawn.image.clamp(0, 1), sure, camera, up)
+        pixels = torch.stack([like, inside[..., 1], torch.ones_like(like)], -1)
+        sums += lift(*shape, camera, pixels.contiguous(), antialiased=antialiased)
+    found = sums[:, :2] / sums[:, 2:].clamp_min(_MIN_SHOWN_PIXELS)
+    return found[:, 0], found[:, 1]
 
 
 def relit_harmonics(

@@ -11,7 +11,7 @@ from fprf.light.sky import kelvin_colour, light_of, sun_colour
 def test_a_sun_is_dimmer_and_redder_the_lower_it_stands() -> None:
     before = None
     for elevation in (60.0, 30.0, 10.0, 3.0):
-        light, _ = light_of(SunConfig(sun=(0.0, elevation)))
+        light = light_of(SunConfig(sun=(0.0, elevation)))
         if before is not None:
             assert float(light.sun[1]) < float(before.sun[1])
             assert float(light.sun[0] / light.sun[2]) > float(before.sun[0] / before.sun[2])
@@ -34,8 +34,8 @@ def test_other_texts_are_no_colours(text: str) -> None:
 
 
 def test_colours_take_the_place_of_the_lights_own() -> None:
-    plain, _ = light_of(SunConfig(light="noon"))
-    coloured, _ = light_of(SunConfig(light="noon", sun_colour="#ff8000", sky_colour="20000K"))
+    plain = light_of(SunConfig(light="noon"))
+    coloured = light_of(SunConfig(light="noon", sun_colour="#ff8000", sky_colour="20000K"))
     luma = torch.tensor([0.2126, 0.7152, 0.0722])
     assert float(coloured.sun @ luma) == pytest.approx(float(plain.sun @ luma), rel=1e-5)
     assert float(coloured.sun[2]) < 0.1 * float(coloured.sun[0])

@@ -21,7 +21,7 @@ from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.pinholes import camera_of
-from fprf.splats.relighting import relit_harmonics, world_axes
+from fprf.splats.relighting import find_illumination, relit_harmonics, world_axes
 from fprf.splats.scene import SplatScene, illuminated
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import save_dictionary
@@ -53,6 +53,29 @@ def test_the_side_towards_the_sun_is_bright_and_the_other_dark(scene: SplatScene
     facing = torch.nn.functional.normalize(scene.gaussians.means, dim=1) @ toward
     shown = known().surfaces.weights > 1
     assert float(gain[shown & (facing > 0.7)].mean()) > 1.5 * float(gain[shown & (facing < -0.3)].mean())
+
+
+def test_a_sun_that_nobody_placed_stands_where_most_is_lit(scene: SplatScene) -> None:
+    gaussians = scene.gaussians
+    # A wall on one side of all that the views show.
+    known = find_illumination(gaussians, scene.views, antialiased=False, near=scene.near)
+    best = known.azimuth
+    wall = known.sun_direction(best, 10.0)
+    across = torch.linalg.cross(wall, known.up)
+    at = torch.linspace(-3, 3, 40)
+    grid = at[:, None, None] * across + (at[None, :, None] + 1.0) * known.up + 3 * wall
+    count = 40 * 40
+    walled = Gaussians(
+        torch.cat([gaussians.means, grid.reshape(-1, 3)]),
+        torch.cat([gaussians.quaternions, gaussians.quaternions[:1].expand(count, -1)]),
+        torch.cat([gaussians.log_scales, torch.full((count, 3), -2.0)]),
+        torch.cat([gaussians.logits, torch.full((count,), 6.0)]),
+        torch.cat([gaussians.harmonics, gaussians.harmonics[:1].expand(count, -1, -1)]),
+    )
+    # The ball alone counts: the wall is seen by nobody.
+    blockers = find_illumination(walled, scene.views, antialiased=False, near=scene.near).blockers
+    turned = replace(known, blockers=blockers).azimuth
+    assert abs((turned - best + 180) % 360 - 180) > 60
 
 
 def test_a_light_is_exact_on_harmonics_from_every_direction(scene: SplatScene) -> None:
