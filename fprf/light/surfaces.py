@@ -77,7 +77,8 @@ def find_surfaces(
     middle = means.mean(0)
     shape = (quaternions, log_scales, logits)
     axes = axes_of(quaternions)
-    sums = torch.zeros(len(means), 8)
+    up = up.to(means)
+    sums = means.new_zeros(len(means), 8)
     for camera in cameras:
         here = _about(camera, middle)
         at = means - middle
@@ -91,7 +92,7 @@ def find_surfaces(
     seen = weight > _MIN_SEEN_PIXELS
     part = weight.clamp_min(_MIN_SEEN_PIXELS)[:, None]
     sure = torch.where(seen, (sums[:, :3] / part).norm(dim=1).clamp(0, 1), torch.zeros(()))
-    normals = torch.where(seen[:, None], torch.nn.functional.normalize(sums[:, :3], dim=1), up.float())
+    normals = torch.where(seen[:, None], torch.nn.functional.normalize(sums[:, :3], dim=1), up)
     points = torch.where(seen[:, None], sums[:, 3:6] / part + middle, means)
     usual = (sums[:, 6] / part[:, 0])[seen].median() if bool(seen.any()) else torch.ones(())
     widths = torch.where(seen, sums[:, 6] / part[:, 0], usual)
@@ -113,7 +114,7 @@ def _view_surface(
     antialiased: bool,
 ) -> _Map:
     """Points and normals at the pixels of a view."""
-    world = camera.world_to_camera.float()
+    world = camera.world_to_camera.to(means)
     eye = -world[:3, :3].T @ world[:3, 3]
     ray = means - eye
     depth = (ray @ world[2, :3]).clamp_min(camera.near)
@@ -130,7 +131,7 @@ def _view_surface(
     spread = (inside[..., 1] - disparity.square()).clamp_min(0) / disparity.square().clamp_min(1e-20)
     deviation = (spread + inside[..., 2].square()) / _SURE_DEVIATION**2
     sure = drawn.opacity.square() / (1 + deviation).square()
-    plane = torch.from_numpy(_fitted_planes(disparity.numpy(), sure.numpy()))
+    plane = torch.from_numpy(_fitted_planes(disparity.cpu().numpy(), sure.cpu().numpy())).to(means)
     return _on_planes(
         plane, camera, float(1 / disparity[drawn.opacity > 0.5].median().clamp_min(1e-9)), world
     )
@@ -141,8 +142,10 @@ def _on_planes(plane: Annotated[Tensor, "H W 3"], camera: Pinhole, usual: float,
     pixels.
     """
     height, width = plane.shape[:2]
-    k = camera.intrinsics.float()
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    k = camera.intrinsics.to(plane)
+    rows = torch.arange(height, device=plane.device) + 0.5
+    columns = torch.arange(width, device=plane.device) + 0.5
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
     tangent_x = (x - k[0, 2]) / k[0, 0]
     tangent_y = (y - k[1, 2]) / k[1, 1]
     # With tangents u and v: 1 / z = a fx u + b fy v + d, so that a fx X + b fy Y + d Z = 1 is the plane.

@@ -80,12 +80,16 @@ def transport(
 
     `frame` is that of `frame_of`. A Gaussian counts where a ray meets it more than `offset` above the point,
     and fully from `offset` + `soft` on. Gaussians are widened
-    across the light by a deviation of `blur`.
+    across the light by a deviation of `blur`. Computed on the CPU; the result is where the points are.
     """
+    device = points.device
+    points = points.cpu()
+    frame = frame.float().cpu()
+    blockers = Blockers(*(each.cpu() for each in blockers))
     # Into the frame of the light, about the middle, where float32 is fine.
     middle = blockers.means.mean(0) if len(blockers.means) else points.mean(0)
-    turn = frame.float().numpy()
-    place = ((points - middle) @ frame.float().T).contiguous().numpy()
+    turn = frame.numpy()
+    place = ((points - middle) @ frame.T).contiguous().numpy()
     means = (blockers.means - middle).contiguous().numpy()
     rows = np.empty((len(means), COLUMNS), np.float32)
     gaussians = (means, blockers.covariances.contiguous().numpy(), blockers.opacities.contiguous().numpy())
@@ -111,12 +115,12 @@ def transport(
         np.argsort(cells, kind="stable"),
         place,
         cells,
-        offset.float().contiguous().numpy(),
-        soft.float().clamp_min(1e-12).contiguous().numpy(),
+        offset.float().cpu().contiguous().numpy(),
+        soft.float().cpu().clamp_min(1e-12).contiguous().numpy(),
     )
     out = np.empty(len(place), np.float32)
     on_threads(reach, receivers, Lists(starts, ids, rows), out)
-    return torch.from_numpy(out)
+    return torch.from_numpy(out).to(device)
 
 
 def disc_directions(
@@ -163,10 +167,10 @@ def openness(
     """Share of the sky's light in [0, 1] that reaches points: the mean over directions of the sky, by how far
     surfaces face them.
     """
-    total = torch.zeros(len(points))
-    facing = torch.zeros(len(points))
-    for direction in sky_directions(up):
-        weight = (normals @ direction.float()).clamp_min(_LEAST_FACING)
+    total = points.new_zeros(len(points))
+    facing = points.new_zeros(len(points))
+    for direction in sky_directions(up.cpu()):
+        weight = (normals @ direction.to(normals)).clamp_min(_LEAST_FACING)
         total += weight * transport(blockers, points, frame_of(direction), offset, soft, blur=blur)
         facing += weight
     return total / facing

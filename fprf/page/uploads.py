@@ -18,6 +18,7 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 import zipfile
 import zlib
 from multiprocessing.connection import Connection
@@ -37,7 +38,13 @@ MAX_BYTES = 20 << 20
 MAX_SIDE = 1024
 """Longest side of what is kept of one: scenes' views are hardly larger."""
 _MAX_DECODING_SECONDS = 30.0
-"""Seconds for one photograph, the start of the decoder included; by eye."""
+"""Seconds of the processor for one photograph, the start of the decoder included; by eye. On a machine that does
+other work it may take as long as it needs.
+"""
+_MAX_IDLE_SECONDS = 60.0
+"""Seconds in which a decoder must have had the processor at all; by eye."""
+_POLL_SECONDS = 0.2
+"""Between looks at how much it has had."""
 _MAX_DECODER_BYTES = 2 << 30
 """Bytes beyond what the decoder has at its start: 1e8 pixels take 0.3 GB, and some copies."""
 _MAX_ANSWER_BYTES = 4096
@@ -94,11 +101,11 @@ class Uploads:
                 pipe = self._started()
                 # Bytes and no pickles: whatever a photograph made of the decoder, its answer is text here.
                 pipe.send_bytes(json.dumps([str(source), str(target)]).encode())
-                if pipe.poll(self._timeout):
-                    answer = pipe.recv_bytes(_MAX_ANSWER_BYTES).decode(errors="replace")
-                else:
-                    answer = f"not decoded within {self._timeout:g} s; export it again"
+                answer = self._waited(pipe)
+                if answer:
                     self._end()
+                else:
+                    answer = pipe.recv_bytes(_MAX_ANSWER_BYTES).decode(errors="replace")
             except (OSError, EOFError):  # it died over this one
                 answer = "cannot be decoded; export it again, or make it smaller"
                 self._end()
@@ -107,6 +114,26 @@ class Uploads:
         if answer:
             raise DataError(f"photograph: {answer}")
         return target
+
+    def _waited(self, pipe: Connection) -> str:
+        """Wait until the decoder answers; return why it never will, else an empty text."""
+        assert self._process is not None  # by `_started`
+        begun = processor_seconds(self._process.pid)
+        used = begun
+        idle = 0.0
+        while not pipe.poll(_POLL_SECONDS):
+            before = used
+            used = processor_seconds(self._process.pid)
+            # Counted by looks and not by the clock, which goes on where this process too is held up.
+            if used > before:
+                idle = 0.0
+            else:
+                idle += _POLL_SECONDS
+            if used - begun > self._timeout:
+                return f"not decoded within {self._timeout:g} s of the processor; export it again"
+            if idle > _MAX_IDLE_SECONDS:
+                return f"its decoder has stood still for {idle:.0f} s; try again"
+        return ""
 
     def close(self) -> None:
         """End the decoder and remove the folder."""
@@ -135,6 +162,16 @@ class Uploads:
             self._pipe.close()
         self._process = None
         self._pipe = None
+
+
+def processor_seconds(process: int | None) -> float:
+    """Seconds of the processor that a process has had so far; where the system does not tell, those of the clock."""
+    try:
+        # Behind the name in brackets, which may hold spaces: times in the program and in the kernel, in ticks.
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, IndexError):
+        return time.monotonic()
 
 
 def limit_memory(room: int) -> None:

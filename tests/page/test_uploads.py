@@ -2,9 +2,11 @@ import os
 import struct
 import subprocess
 import sys
+import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import cv2
@@ -17,6 +19,7 @@ from raw_files import dng
 
 from fprf.errors import DataError, UsageError
 from fprf.io.images import encode
+from fprf.page import uploads
 from fprf.page.uploads import (
     MAX_BYTES,
     MAX_SIDE,
@@ -125,10 +128,50 @@ def test_a_decoder_that_died_is_replaced(uploaded: Uploads) -> None:
     assert uploaded.store(png(20, 20)).is_file() and uploaded._process is not process
 
 
-def test_one_that_takes_too_long_is_ended() -> None:
-    with closing(Uploads(timeout=0.0)) as hasty, pytest.raises(DataError, match="not decoded within"):
-        hasty.store(png(20, 20))
-    assert not hasty.folder.exists()
+def working(pipe: Connection) -> None:
+    """A decoder that comes to no end."""
+    pipe.recv_bytes()
+    while True:
+        pass
+
+
+def sleeping(pipe: Connection) -> None:
+    """A decoder that waits for ever."""
+    pipe.recv_bytes()
+    time.sleep(3600)
+
+
+def held_up(pipe: Connection) -> None:
+    """A decoder that has the processor for a moment now and then."""
+    while True:
+        pipe.recv_bytes()
+        time.sleep(1.5)
+        pipe.send_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("decoder", "said"), [(working, "not decoded within 0.5 s"), (sleeping, "stood still")]
+)
+def test_a_decoder_that_comes_to_no_end_is_ended(
+    decoder: Callable[[Connection], None], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uploads, "decode_photographs", decoder)
+    limit = 0.5
+    if decoder is sleeping:
+        limit = 1e6
+        monkeypatch.setattr(uploads, "_MAX_IDLE_SECONDS", 1.0)
+    with closing(Uploads(timeout=limit)) as found, pytest.raises(DataError, match=said):
+        found.store(png(20, 20))
+    assert not found.folder.exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="this system does not tell")
+def test_a_decoder_may_take_its_time_on_a_loaded_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uploads, "decode_photographs", held_up)
+    with closing(Uploads(timeout=1e6)) as found:
+        found.store(png(20, 20))  # its start counts, too
+        found._timeout = 0.5
+        found.store(png(20, 20))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits are a matter of Unix")
