@@ -3,7 +3,6 @@ Gaussians.
 """
 
 import contextlib
-import functools
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -167,7 +166,10 @@ def _look(config: RestyleConfig, display: Display) -> "tuple[Captures, float]":
     from ..splats.captures import open_captures
 
     begun = time.perf_counter()
-    report = functools.partial(display.count, what="looking")
+
+    def report(what: str, done: int, total: int) -> None:
+        display.count(done, total, what)
+
     seen = open_captures(config.captures, config, cache=config.cache, progress=report, say=display.say)
     # Views are encoded now, or read from the cache: the time is reported apart from that of styles.
     seen.scene.found()

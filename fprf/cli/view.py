@@ -134,17 +134,17 @@ def run(args: list[str]) -> int:
                 session = None
                 # A run that training has only begun is waited for: its first checkpoint is about to come.
                 begun = not is_capture(path) and newest_step(path) < 0
+                waiting = ""
                 if begun:
-                    server.wait(
-                        "opening", f"{path}: no checkpoint yet; it is shown as soon as training saves one"
-                    )
+                    waiting = f"{path}: no checkpoint yet; it is shown as soon as training saves one"
+                    server.wait("opening", waiting, 0.0)
                 if not (config.follow or begun):
                     session = server.open(opening)
                 if not is_capture(path):
                     from ..page.following import TrainingFollower
 
                     # A run that is in training: the scene is loaded anew with each checkpoint.
-                    TrainingFollower(server, path, opening, session).run(threading.Event())
+                    TrainingFollower(server, path, opening, session, waiting).run(threading.Event())
             threading.Event().wait()
         except KeyboardInterrupt:
             # Whatever a thread is in the middle of, the terminal comes back.
@@ -172,22 +172,28 @@ def _load(
         style = StyleConfig(stylizer=config.stylizer or RegionToneConfig())
         name = name or viewed.name
         return replace(viewed, name=name, style=style, references=config.references, pixels=config.pixels)
-    from ..splats.captures import open_capture
+    from ..page.messages import READ_SHARE, SEARCHED_SHARE
+    from ..splats.captures import FINDING_VIEWS, open_capture
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
 
-    def progress(done: int, total: int) -> None:
+    def progress(what: str, done: int, total: int) -> None:
+        share = done / max(1, total)
+        if what == FINDING_VIEWS:
+            words = f"{path.name}: judging places to look at {len(capture.gaussians):,} Gaussians from, {done} of {total}"
+            wait("opening", words, READ_SHARE + (SEARCHED_SHARE - READ_SHARE) * share)
+            return
         words = f"Looking at {path.name}, once: {done} of {total}"
-        wait("looking", "" if done >= total else words, done / max(1, total))
+        wait("looking", "" if done >= total else words, share)
 
-    wait("opening", f"Reading {path.name}", None)
+    wait("opening", f"Reading {path.name}", 0.0)
     capture = read_capture(path, activated=config.activated)
     for note in capture.notes:
         say(f"{capture.path}: {note}")
     look = LookConfig(
         up=config.up, inside=config.inside, activated=config.activated, semantic=config.semantic
     )
-    wait("opening", f"{path.name}: finding places to look at {len(capture.gaussians):,} Gaussians from", None)
+    wait("opening", f"{path.name}: {len(capture.gaussians):,} Gaussians are read", READ_SHARE)
     scene = open_capture(capture, look, progress=progress, say=say)
     name = name or path.resolve().name.partition(".")[0]
     style = StyleConfig(stylizer=config.stylizer or RegionToneConfig(centred=False))

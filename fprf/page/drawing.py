@@ -45,6 +45,10 @@ _MAX_KEPT_STYLES = 24
 """Dictionaries and styles that are kept for when somebody returns to them; by eye."""
 _MIN_POINTED_OPACITY = 0.01
 """Opacity below which there is nothing to point at; by eye."""
+_STYLE_SHARE = 0.2
+"""Of the time that Gaussians are coloured in, that of the style; by eye."""
+_RECOLOURING_SHARE = 0.4
+"""Of the same time, that of the harmonics; the rest is the packing; by eye."""
 CACHE_BYTES = 128 << 20
 """Bytes of features that are kept of each client's last view; by eye."""
 STRIP = 4096
@@ -194,12 +198,26 @@ def matching_regions(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "
     return scores.argmax(-1)
 
 
-def gaussian_colours(scene: SplatScene, packed: Packed, restyler: Restyler, shown: Shown) -> Colours:
-    """Colours of Gaussians in the captured light, for browsers; maps have one colour each."""
+def gaussian_colours(
+    scene: SplatScene,
+    packed: Packed,
+    restyler: Restyler,
+    shown: Shown,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Colours:
+    """Colours of Gaussians in the captured light, for browsers; maps have one colour each. `progress` hears the
+    share that is done.
+    """
+    progress(0.0)
     styled = restyler.styled(shown.look.unlit)
+    progress(_STYLE_SHARE)
     harmonics = scene.restyled(None if styled is None else styled.restyle).shown.harmonics
     if shown.map == "none" and shown.region is None:
-        return packed.colours(harmonics, rounds=2)
+        first = _STYLE_SHARE + _RECOLOURING_SHARE
+        progress(first)
+        return packed.colours(
+            harmonics, rounds=2, progress=lambda share: progress(first + (1 - first) * share)
+        )
     # Maps are flat colours in the place of harmonics: what each Gaussian's features match.
     features = scene.found().features.float()
     solid = torch.ones(len(scene.gaussians))

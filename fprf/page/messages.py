@@ -13,6 +13,14 @@ from ..light.config import LightName
 
 SHELF = 12
 """Photographs on the shelf; the oldest that no look needs makes room."""
+READ_SHARE = 0.12
+"""Of the time in which a scene is opened, what has passed when its file is read (a capture of a million Gaussians)."""
+SEARCHED_SHARE = 0.44
+"""Of the same, when it is known where to look at it from; the rest prepares it for browsers."""
+READ_SHARE = 0.12
+"""Of the time in which a scene is opened, what has passed when its file is read (a capture of a million Gaussians)."""
+SEARCHED_SHARE = 0.44
+"""Of the same, when it is known where to look at it from; the rest prepares it for browsers."""
 
 Text: TypeAlias = Annotated[str, Meta(max_length=80)]
 Number: TypeAlias = Annotated[float, Meta(ge=-1e9, le=1e9)]  # NaN fails either bound

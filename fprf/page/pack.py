@@ -18,7 +18,7 @@ for scenes of any extent.
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -68,11 +68,17 @@ class Packed:
     largest: float
     """Magnitude of the palette's largest harmonic."""
 
-    def colours(self, harmonics: Annotated[Tensor, "n K' 3"], rounds: int = 6) -> Colours:
+    def colours(
+        self,
+        harmonics: Annotated[Tensor, "n K' 3"],
+        rounds: int = 6,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> Colours:
         """A style by the harmonics of all Gaussians that were given, in their order; harmonics that it lacks
         are 0.
 
-        `rounds` of fitting its maps: fewer for one that is shown at once, and soon replaced.
+        `rounds` of fitting its maps: fewer for one that is shown at once, and soon replaced. `progress` hears
+        the share that is done.
         """
         # Means between the least and the most of the style, 8 bits a channel.
         styled = harmonics[self.order, :_PAGE_HARMONICS]
@@ -86,12 +92,16 @@ class Packed:
         if styled.shape[1] < self.harmonics.shape[1]:
             maps = np.zeros((1, 9), np.float32)
         elif self.harmonics.shape[1] > 1 and not torch.equal(styled[:, 1:], self.harmonics[:, 1:]):
-            rows[:, 3], maps = fit_maps(self.harmonics[:, 1:], styled[:, 1:], rounds)
+            rows[:, 3], maps = fit_maps(self.harmonics[:, 1:], styled[:, 1:], rounds, progress=progress)
         return Colours(rows, low, high, maps)
 
 
-def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
-    """Pack finite Gaussians with at most `entries` (65536) harmonics in the palette."""
+def pack(
+    gaussians: Gaussians, entries: int = 4096, progress: Callable[[float], None] = lambda share: None
+) -> Packed:
+    """Pack finite Gaussians with at most `entries` (65536) harmonics in the palette; `progress` hears the share
+    that is done.
+    """
     order = torch.from_numpy(spatial_order(gaussians.means.numpy()))
     gaussians = gaussians.select(order)
     count = len(gaussians)
@@ -113,7 +123,7 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
     left_out, three = smallest_three(gaussians.quaternions.numpy())
     turn = steps(three / 2 + 0.5, 1023)
     harmonics = gaussians.harmonics[:, :_PAGE_HARMONICS]
-    palette, label, largest = _palette(harmonics[:, 1:], entries)
+    palette, label, largest = _palette(harmonics[:, 1:], entries, progress)
     words = np.zeros((count, 4), "<u4")
     words[:, 0] = place[:, 0] | place[:, 1] << 16
     words[:, 1] = place[:, 2] | label << 16
@@ -127,7 +137,7 @@ def pack(gaussians: Gaussians, entries: int = 4096) -> Packed:
 
 
 def _palette(
-    rest: Annotated[Tensor, "N K-1 3"], entries: int
+    rest: Annotated[Tensor, "N K-1 3"], entries: int, progress: Callable[[float], None]
 ) -> tuple[Annotated[NDArray[np.int8], "E K-1 4"], NDArray[np.int64], float]:
     """Entries, the one of each row, and the largest magnitude: k-means of k-means, or each row its own where
     there are few.
@@ -147,6 +157,7 @@ def _palette(
         books: list[Tensor] = []
         label = torch.zeros(count, dtype=torch.int64)
         for group in range(side):
+            progress(group / side)
             inside = (groups == group).nonzero()[:, 0]
             if len(inside):
                 means, mine = _clustered(rows[inside], side)
@@ -190,12 +201,13 @@ def fit_maps(
     after: Annotated[Tensor, "N K-1 3"],
     rounds: int = 6,
     count: int = MAPS,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[NDArray[np.uint8], Annotated[NDArray[np.float32], "M 9"]]:
     """At most 256 matrices A, and for each row the one by which before A comes nearest to after, in least
     squares.
 
     The error of a row is <G, A A^T> - 2 <H, A> + const with G = before^T before and H = before^T after: a
-    product of 18 numbers, whatever K is.
+    product of 18 numbers, whatever K is. `progress` hears the share of rounds that are done.
     """
     grams = torch.einsum("nki,nkj->nij", before, before).flatten(1)
     crosses = torch.einsum("nki,nkj->nij", before, after).flatten(1)
@@ -209,6 +221,7 @@ def fit_maps(
     maps = torch.linalg.solve(grams[some].view(-1, 3, 3) + ridge, crosses[some].view(-1, 3, 3) + ridge)
     maps = torch.cat([torch.eye(3)[None], maps])
     for step in range(rounds + 1):
+        progress(step / (rounds + 1))
         # Assign each row to the map of the least error, then solve each map's normal equations over its rows.
         book = torch.cat([(maps @ maps.transpose(1, 2)).flatten(1), maps.flatten(1)], 1)
         parts = []

@@ -26,7 +26,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..errors import DataError, FprfError, UsageError
 from . import EXAMPLES, css, read_asset, script
 from .access import MAX_WAIT_SECONDS, Access, Guard, is_loopback, network_address, qr_code
-from .messages import PictureRequest, StartRequest, read_message
+from .messages import SEARCHED_SHARE, PictureRequest, StartRequest, read_message
 from .start import Start
 
 if TYPE_CHECKING:
@@ -205,9 +205,10 @@ class ViewerServer:
         from .session import Session
 
         try:
+            self.wait("opening", "Reading the scene", 0.0)
             viewed = load()  # while what was open stays open
             self._close_session()
-            self.wait("opening", f"{viewed.name}: preparing it for the browser")
+            self.wait("opening", f"{viewed.name}: preparing it for the browser", SEARCHED_SHARE)
             session = self._opened.enter_context(Session(viewed, self.post))
         finally:
             self.wait("opening")

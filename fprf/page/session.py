@@ -128,7 +128,7 @@ class Session:
         self._history = History()
         self._digests: dict[Photograph, str] = {}
         self._saving: threading.Timer | None = None
-        self._load()
+        self._load(self._tell_opening)
         # What was made before comes back first; until then nothing is written over it.
         self._folder: Path | None = None
         self._of = ""
@@ -218,13 +218,19 @@ class Session:
             self._folder = None  # said once
             self.notify(f"looks and photographs are not kept: {error}", bad=True)
 
-    def _load(self) -> None:
+    def _tell_opening(self, share: float) -> None:
+        what = f"{self.viewed.name}: preparing it for the browser"
+        self.tell("opening", what, messages.SEARCHED_SHARE + (1 - messages.SEARCHED_SHARE) * share)
+
+    def _load(self, progress: Callable[[float], None] = lambda share: None) -> None:
         """Prepare what browsers are sent of Gaussians, or the painter of any other scene."""
         scene = self.viewed.scene
         home = self.viewed.home
         if isinstance(scene, SplatScene):
             # Shapes and captured colours go to browsers once.
-            self.packed, head, parts = packed_scene(scene, [scene.gaussians.harmonics], home, level=1)
+            self.packed, head, parts = packed_scene(
+                scene, [scene.gaussians.harmonics], home, level=1, progress=progress
+            )
             self.geometry = container(head, parts)
             self._lights = Lights(
                 scene, self.packed.order, self._worker, self._post, self.tell, self._version
@@ -614,9 +620,11 @@ class Session:
         """Make colours for browsers, of what is shown now or of a look that is kept."""
         scene = self.viewed.scene
         assert isinstance(scene, SplatScene)
-        self.tell("colouring", f"Colouring {len(scene.gaussians):,} Gaussians", None)
+        what = f"Colouring {len(scene.gaussians):,} Gaussians"
         try:
-            colours = gaussian_colours(scene, self.packed, self.restyler, shown)
+            colours = gaussian_colours(
+                scene, self.packed, self.restyler, shown, lambda share: self.tell("colouring", what, share)
+            )
         finally:
             self.tell("colouring", "", None)
         version = next(self._version)

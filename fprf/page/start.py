@@ -42,6 +42,8 @@ _MAX_RECENT_SCENES = 12
 """Scenes that the page offers to open; by eye."""
 _MAX_EXIT_SECONDS = 10.0
 """Seconds that a process has to save and end; by eye."""
+_TOLD_SECONDS = 0.25
+"""Between two tellings of how far an end is."""
 _MAX_SILENT_SECONDS = 60.0
 """Without a piece of a file, after which a page that was sending has given up; by eye."""
 _PREVIEW_PIXELS = 320
@@ -102,6 +104,8 @@ class Start:
         self._stopped = ""
         """Request on which it was stopped: `stop` or `leave`."""
         self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
+        """Nothing is being made."""
 
     def close(self) -> None:
         """End what is being made, as an interrupt at the terminal would."""
@@ -209,7 +213,7 @@ class Start:
                 self._begin(source, name, asked.minutes)
             case Stop() if self._progress.error is None:
                 if self._busy:
-                    self._server.wait("ending", "Ending it; what there is is being saved")
+                    threading.Thread(target=self._tell_ending, name="fprf-ending", daemon=True).start()
                 self._interrupt("stop")
             case Stop() | Leave():  # a failure is put away, with what is shown of it
                 if self._busy:
@@ -314,6 +318,7 @@ class Start:
             else:
                 folder = source.path
             self._progress = StartProgress(name=name, stage="opening", folder=str(folder))
+            self._ended.clear()
             self._thread = threading.Thread(
                 target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True
             )
@@ -328,11 +333,11 @@ class Start:
         # needed.
         try:
             if source.kind in ("photographs", "video"):
-                self._set(stage="poses", what="looking at the photographs")
+                self._set(stage="poses", what="looking at the photographs", share=0.0)
                 self._call(["process", str(path), "--output", str(root / _SCENE_FOLDER)])
                 path = root / _SCENE_FOLDER
             if source.kind in ("photographs", "video", "scene"):
-                self._set(stage="training", what="reading photographs", share=None, detail="")
+                self._set(stage="training", what="reading photographs", share=0.0, detail="")
                 self._train(path, root / _RUN_FOLDER, name, minutes)
             else:
                 self._set(stage="opening", what="opening the scene", share=None, detail="")
@@ -350,7 +355,9 @@ class Start:
         except Exception as error:  # whatever it is, the page goes on and the files are there
             self._set(error=f"this should not have happened: {type(error).__name__}: {error}")
         finally:
-            self._server.wait("ending")
+            with self._lock:
+                self._ended.set()
+                self._server.wait("ending")
 
     def _train(self, data: Path, run: Path, name: str, minutes: float) -> None:
         """Train a scene; from its first checkpoint on the viewer shows it."""
@@ -447,6 +454,17 @@ class Start:
             )
             last.daemon = True
             last.start()
+
+    def _tell_ending(self) -> None:
+        """Tell pages that what runs is saving, and how much is over of the time that it has for it."""
+        what = f"Ending it; what there is is being saved, within {_MAX_EXIT_SECONDS:g} s"
+        begun = time.monotonic()
+        while not self._ended.is_set():
+            with self._lock:
+                if not self._ended.is_set():
+                    share = (time.monotonic() - begun) / _MAX_EXIT_SECONDS
+                    self._server.wait("ending", what, min(1.0, share))
+            self._ended.wait(_TOLD_SECONDS)
 
     def _set(self, **changes: Any) -> None:
         self._tell(replace(self._progress, **changes))

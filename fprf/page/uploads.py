@@ -43,7 +43,7 @@ other work it may take as long as it needs.
 """
 _MAX_IDLE_SECONDS = 60.0
 """Seconds in which a decoder must have had the processor at all; by eye."""
-_POLL_SECONDS = 0.2
+_LOOK_SECONDS = 0.2
 """Between looks at how much it has had."""
 _MAX_DECODER_BYTES = 2 << 30
 """Bytes beyond what the decoder has at its start: 1e8 pixels take 0.3 GB, and some copies."""
@@ -121,14 +121,14 @@ class Uploads:
         begun = processor_seconds(self._process.pid)
         used = begun
         idle = 0.0
-        while not pipe.poll(_POLL_SECONDS):
+        while not pipe.poll(_LOOK_SECONDS):
             before = used
             used = processor_seconds(self._process.pid)
             # Counted by looks and not by the clock, which goes on where this process too is held up.
             if used > before:
                 idle = 0.0
             else:
-                idle += _POLL_SECONDS
+                idle += _LOOK_SECONDS
             if used - begun > self._timeout:
                 return f"not decoded within {self._timeout:g} s of the processor; export it again"
             if idle > _MAX_IDLE_SECONDS:

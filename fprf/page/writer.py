@@ -5,6 +5,7 @@ It loads nothing. Where there are no Gaussians, or no WebGL 2, the stage shows p
 
 import base64
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -45,6 +46,8 @@ REFERENCE_PIXELS = 320
 """Longest side of references: as match maps, which lie beside them."""
 _MAX_PAGE_CAMERAS = 48
 """Captured cameras that one can go to, at most; by eye."""
+_PACKING_SHARE = 0.5
+"""Of the time that a scene is prepared in; the rest is the depths of its cameras (a million Gaussians, by eye)."""
 _MAX_SEEN_CAMERAS = 256
 """Cameras that say what was photographed, at most; by eye: frames of neighbours overlap."""
 _PHOTOGRAPHS_FILL = 0.75
@@ -214,17 +217,19 @@ def packed_scene(
     kept: Annotated[Tensor, "n"] | None = None,
     level: int = 9,
     suns: Suns | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Packed, dict[str, Any], dict[str, bytes]]:
     """Pack a scene's Gaussians, of those `kept`, in several colours, of which the first is captured, and the
     lights of a day on all of them; return the head and the deflated sections that the page reads, too.
 
-    The page begins at the camera `start`. `level` of deflating: 1 where somebody waits.
+    The page begins at the camera `start`. `level` of deflating: 1 where somebody waits. `progress` hears the
+    share that is done.
     """
     gaussians = scene.gaussians.recoloured(harmonics[0])
     if kept is not None:
         gaussians = gaussians.select(kept)
         harmonics = [each[kept] for each in harmonics]
-    packed = pack(gaussians)
+    packed = pack(gaussians, progress=lambda share: progress(_PACKING_SHARE * share))
     parts = sections(packed, level)
     styles = []
     for k, each in enumerate(harmonics):
@@ -240,7 +245,14 @@ def packed_scene(
         "background": list(scene.background),
         "fills": 0.0 if scene.poses is None else _PHOTOGRAPHS_FILL,
     }
-    place = about(scene.views, start, lambda view: _depth(scene, view))
+    depths = min(len(scene.views), _MAX_PAGE_CAMERAS)
+    looked = itertools.count()
+
+    def depth(view: int) -> float:
+        progress(_PACKING_SHARE + (1 - _PACKING_SHARE) * next(looked) / depths)
+        return _depth(scene, view)
+
+    place = about(scene.views, start, depth)
     return packed, {**header(packed), **drawing, **place, "styles": styles}, parts
 
 

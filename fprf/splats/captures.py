@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -44,6 +44,10 @@ from .scene import SplatScene, with_illumination
 from .semantics import Semantics, find_semantics, load_semantics, semantics_tensors, tensor_group
 from .views import find_views
 
+Progress: TypeAlias = Callable[[str, int, int], None]
+"""Hears what is being done, and how many of how many steps of it are."""
+FINDING_VIEWS = "finding views"
+LOOKING = "looking"
 SAMPLE = 2_000_000
 """Gaussians that are looked at, at most: what is in memory of captures of any size, beside the file at
 hand.
@@ -91,14 +95,14 @@ def look_at_capture(
     antialiased: bool,
     encoder: Encoder,
     config: LookConfig,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda what, done, total: None,
     camera: Cameras | None = None,
 ) -> SplatScene:
     """Find views of Gaussians that are all finite, sizes included. What they show is found when it is first
     asked for.
 
-    `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can
-    be seen.
+    `camera` is the view that the capture was made from, where it is known. `progress` hears of "finding views"
+    and "looking". Raises DataError where nothing can be seen.
     """
     # Mistakes are told before views are sought, which takes seconds.
     up = torch.tensor(config.up or USUAL_UP)
@@ -110,18 +114,17 @@ def look_at_capture(
         )
     cameras = find_views(
         gaussians,
-        count=config.views,
-        size=config.size,
-        up=up,
-        inside=config.inside,
+        config,
         antialiased=antialiased,
         camera=camera,
+        progress=functools.partial(progress, FINDING_VIEWS),
     )
 
     def found() -> Semantics:
         near = clip_distance(gaussians)
+        told = functools.partial(progress, LOOKING)
         return find_semantics(
-            gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress
+            gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=told
         )
 
     return _scene_of(gaussians, antialiased, cameras, functools.cache(found), encoder)
@@ -147,7 +150,7 @@ def open_capture(
     look: LookConfig,
     *,
     cache: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda what, done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> SplatScene:
     """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
@@ -278,7 +281,7 @@ def open_captures(
     first: Capture | None = None,
     sample: int = SAMPLE,
     cache: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda what, done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Captures:
     """Read captures and see them as one scene; arguments as those of `open_capture`.

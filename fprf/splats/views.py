@@ -15,6 +15,7 @@ docstring names no measurement were chosen by eye.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Annotated, NamedTuple
 
@@ -24,8 +25,10 @@ from torch import Tensor
 from ..errors import DataError
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
+from .config import LookConfig
 from .drawing import clip_distance, draw
 from .gaussians import MAX_BULK_DISTANCE, Gaussians, bulk_of
+from .ground import USUAL_UP
 from .pinholes import camera_of
 
 # When a capture counts as a room.
@@ -161,29 +164,30 @@ _CLOSE_COST = 3.0
 @torch.inference_mode()
 def find_views(
     gaussians: Gaussians,
+    look: LookConfig,
     *,
-    count: int,
-    size: tuple[int, int],
-    up: Annotated[Tensor, "3"],
-    inside: bool | None = None,
     antialiased: bool = False,
     camera: Cameras | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Cameras:
-    """At most `count` views of `size` (width, height), the nearer ones around an object first.
+    """At most as many views as `look` asks for, the nearer ones around an object first.
 
-    `inside` says whether cameras stand within the capture; None = found out. Where the `camera` is known that
-    the capture was made from, it is the first view, and the others stand about it. Gaussians very far from
-    the others play no part. Raises DataError where nothing can be seen from anywhere.
+    Where the `camera` is known that the capture was made from, it is the first view, and the others stand
+    about it. Gaussians very far from the others play no part. `progress` hears how many candidates of a search
+    are judged. Raises DataError where nothing can be seen from anywhere.
     """
+    size = look.size
+    inside = look.inside
+    up = torch.tensor(look.up or USUAL_UP).double()
     near = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart <= MAX_BULK_DISTANCE)
     if not bool(near.all()):
         gaussians = gaussians.select(near)
-    search = _ViewSearch(gaussians, size, up.double() / up.double().norm(), antialiased)
+    search = _ViewSearch(gaussians, size, up / up.norm(), antialiased, progress)
     room = is_room(gaussians) if inside is None else inside
     # About where sizes say that photographs were taken; else within what surrounds a free place; else around
     # the object.
     chosen = None
-    others = count if camera is None else count - 1
+    others = look.views if camera is None else look.views - 1
     if inside is not False:
         place = None
         if camera is not None:
@@ -253,12 +257,18 @@ class _ViewSearch:
     """
 
     def __init__(
-        self, gaussians: Gaussians, size: tuple[int, int], up: Annotated[Tensor, "3"], antialiased: bool
+        self,
+        gaussians: Gaussians,
+        size: tuple[int, int],
+        up: Annotated[Tensor, "3"],
+        antialiased: bool,
+        progress: Callable[[int, int], None],
     ) -> None:
         self.gaussians = gaussians
         self.size = size
         self.up = up
         self.antialiased = antialiased
+        self.progress = progress
         opacity = gaussians.opacities
         ends = []
         for axis in gaussians.means.T:
@@ -349,6 +359,7 @@ class _ViewSearch:
         worth = torch.zeros(len(cameras))
         clip = clip_distance(gaussians)
         for view in range(len(small)):
+            self.progress(view, len(small))
             eye = cameras.pose[view, :, 3].float()
             apart = torch.linalg.vector_norm(points - eye, dim=1).clamp_min(1e-9)
             blurred = ((sizes - apart.log() - usual) / _MAX_SIZE_EXCESS).clamp(0, 1)[:, None]
@@ -444,6 +455,7 @@ class _ViewSearch:
         filled = torch.zeros(len(cameras))
         clip = clip_distance(self.coarse)
         for view in range(len(small)):
+            self.progress(view, len(small))
             drawn = draw(self.coarse, camera_of(small, view, clip), antialiased=self.antialiased)
             in_the_way = (drawn.opacity > _MIN_FILLED_OPACITY) & (drawn.depth < float(close[view]))
             filled[view] = drawn.opacity.mean()

@@ -66,6 +66,7 @@ class Shown(Start):
     def __init__(self, output: Path) -> None:
         self.shown: list[tuple[Path, str]] = []
         self.posted: list[Any] = []
+        self.waits: list[tuple[str, str, float | None]] = []
         self.pages = 0
         super().__init__(output, self, self.view)  # type: ignore[arg-type]
 
@@ -85,7 +86,7 @@ class Shown(Start):
         self.shown.clear()
 
     def wait(self, kind: str, what: str = "", share: float | None = None) -> None:
-        """The server's."""
+        self.waits.append((kind, what, share))
 
     def post(self, client: None, kind: str, message: Any) -> None:
         self.posted.append(message)
@@ -146,6 +147,11 @@ def test_a_scene_in_training_is_shown_until_it_is_left(
     page.handle(asked)
     until(lambda: not page._busy)
     assert page.reached(stage=stage) and len(page.shown) == (stage == "open")
+    ending = [(what, share) for kind, what, share in page.waits if kind == "ending"]
+    assert ending[-1] == ("", None), "told as ended"
+    if isinstance(asked, Stop):
+        shares = [share for what, share in ending if what]
+        assert len(shares) > 1 and shares == sorted(shares) and 0 <= shares[0] <= shares[-1] <= 1
 
 
 def test_a_failure_is_told_and_nothing_is_lost(page: Shown, photographs: Path, tmp_path: Path) -> None:

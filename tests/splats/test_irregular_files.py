@@ -92,7 +92,7 @@ def test_flat_gaussians_are_drawn_and_spoil_no_sizes(ending: str, tmp_path: Path
     nearest = torch.cdist(made.means.double(), found.means.double()).argmin(1)
     assert (found.log_scales[nearest[::2], 2] <= -9.9).all()
     drawable = capture.gaussians.drawable()
-    views = find_views(drawable, count=3, size=(64, 48), up=torch.tensor([0.0, -1, 0]))
+    views = find_views(drawable, LookConfig(views=3, size=(64, 48)))
     thin = Gaussians(**(vars(made) | {"log_scales": made.log_scales.clamp_min(-14)}))
     shown, wanted = (draw(each, camera_of(views, 0)).image for each in (drawable, thin))
     assert wanted.amax() > 0.4 and (shown - wanted).abs().max() < 1e-3
@@ -267,7 +267,6 @@ def test_stray_gaussians_decide_neither_views_nor_semantics() -> None:
 
 ENDINGS = {"ply": 1e-6, "splat": 1e-6, "spz": 2e-6, "sog": 1e-4, "compressed.ply": 2e-3}
 """Formats, and the errors of positions that their bits leave in a ball of radius 1."""
-UP = torch.tensor([0.0, -1.0, 0.0])
 
 
 def in_world(path: Path) -> np.ndarray:
@@ -357,7 +356,7 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
 def test_in_other_units_the_same_is_seen(factor: float) -> None:
     own = ball(300)
     other = scaled(ball(300), factor)
-    views = [find_views(each, count=4, size=(48, 36), up=UP, inside=False) for each in (own, other)]
+    views = [find_views(each, LookConfig(views=4, size=(48, 36), inside=False)) for each in (own, other)]
     assert torch.allclose(
         views[0].pose[:, :, 3] * factor, views[1].pose[:, :, 3], rtol=1e-4, atol=1e-4 * factor
     )

@@ -44,7 +44,6 @@ from fprf.style.restyle import Styled, apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
 TONE = RegionToneConfig(centred=False)
-UP = torch.tensor([0.0, -1.0, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +264,7 @@ def test_a_capture_is_restyled_alike_where_nothing_can_be_cached(
 
 
 def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
-    seen = find_views(ball(400), count=8, size=(64, 48), up=UP)
+    seen = find_views(ball(400), LookConfig(views=8, size=(64, 48)))
     assert len(seen) == 8 and (seen.pose[:, :, 3].norm(dim=1) > 1.2).all()
     assert (seen.pose[:, 1, 1] < 0).all(), "upright: the camera's up is -y"
     # A room: a closed box of flat Gaussians, seen from within.
@@ -284,22 +283,20 @@ def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
     opaque = torch.full((count,), 4.0)
     flat[-5000:] = -4.0  # near things are finer
     room = Gaussians(means, torch.eye(4)[:1].expand(count, 4), flat, opaque, torch.zeros(count, 1, 3))
-    within = find_views(room, count=8, size=(64, 48), up=UP)
+    within = find_views(room, LookConfig(views=8, size=(64, 48)))
     assert (within.pose[:, :, 3].abs() < half).all()
     assert all(float(draw(room, camera_of(within, v)).opacity.mean()) > 0.95 for v in range(len(within)))
     # A hollow object is as closed as a room.
     for given, inside in ((room.select(slice(-5000)), None), (room, False)):
-        outside = find_views(given, count=8, size=(64, 48), up=UP, inside=inside)
+        outside = find_views(given, LookConfig(views=8, size=(64, 48), inside=inside))
         assert not (outside.pose[:, :, 3].abs() < half).all(1).any()
     one = replace(ball(200), means=torch.zeros(200, 3), log_scales=torch.zeros(200, 3))
-    assert len(find_views(one, count=2, size=(64, 48), up=UP)) == 2, "all in one place, of one size"
+    assert len(find_views(one, LookConfig(views=2, size=(64, 48)))) == 2, "all in one place, of one size"
     few = room.select(slice(4))
     with pytest.raises(DataError):
         find_views(
             replace(few, log_scales=few.log_scales - 30, logits=few.logits - 30),
-            count=2,
-            size=(64, 48),
-            up=UP,
+            LookConfig(views=2, size=(64, 48)),
         )
 
 
@@ -319,7 +316,7 @@ def test_views_stand_where_the_sizes_of_gaussians_say_that_photographs_were_take
     scene = Gaussians(
         means, turn, size[:, None].expand(-1, 3).clone(), torch.full((len(means),), 3.0), means[:, None] * 0
     )
-    seen = find_views(scene, count=12, size=(64, 48), up=UP)
+    seen = find_views(scene, LookConfig(views=12, size=(64, 48)))
     eye = seen.pose[:, :, 3]
     ahead = -seen.pose[:, :, 2]
     assert float((eye - place).norm(dim=1).median()) < 3

@@ -293,7 +293,7 @@ class Live {
       return;
     }
     const { head, parts } = await unpacked(await asked("/scene"), (share) => wait("scene", "Fetching the scene", share));
-    wait("scene", "Unpacking the scene");
+    wait("scene", "Unpacking the scene", 0);
     this.mode("scene");
     this.scene = scene;
     document.title = `${scene.name} - fprf`;
@@ -306,6 +306,7 @@ class Live {
       try {
         splats = before ? this.place.splats : new Splats(at("canvas"));
         await splats.load(head, parts);
+        wait("scene", "Unpacking its colours", 0.7);
         await splats.add("Captured", head.styles[0], parts["style-0"]);
       } catch (error) {
         if (before) throw error;
