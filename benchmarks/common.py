@@ -1,4 +1,4 @@
-"""What all benchmarks share: folders, arguments, the run that is measured, costs of commands, and the JSON
+"""Common parts of benchmarks: folders, arguments, the run that is measured, costs of commands, and the JSON
 that each writes.
 """
 
@@ -45,7 +45,7 @@ def arguments(name: str, about: str | None) -> argparse.ArgumentParser:
 
 
 def origin(device: str = "cpu") -> dict[str, object]:
-    """Where figures come from: `commit`, `fprf`, `torch`, `machine`, `command`."""
+    """Origin of figures: `commit`, `fprf`, `torch`, `machine`, `command`."""
     return provenance(device) | {"command": shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]])}
 
 
@@ -66,7 +66,7 @@ def add_entry(path: Path | None, name: str, figures: Mapping[str, Any], device: 
 
 
 class Cost(NamedTuple):
-    """What a command took."""
+    """Cost of a command."""
 
     seconds: float
     processor_seconds: float

@@ -23,7 +23,7 @@ from .report import number, table
 _RISING = ("/s", "dB")
 """Ends of units of which more is better; of all others less is."""
 _SAME_MACHINE = ("processor", "cores", "threads", "device")
-"""What two machines must share for plain figures to be compared."""
+"""Properties that two machines must share for plain figures to be compared."""
 
 
 class Change(NamedTuple):
@@ -35,7 +35,7 @@ class Change(NamedTuple):
     gain: float | None
     """After over before, above 1 where it is better: the largest of what counts. None where nothing does."""
     fault: str
-    """What was lost; empty = nothing."""
+    """Losses; empty = none."""
 
 
 def main(argv: list[str]) -> int:

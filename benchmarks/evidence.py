@@ -1,4 +1,4 @@
-"""Where figures come from, and which of them pages may quote.
+"""Origins of figures, and a check of those that pages quote.
 
 Each result, `benchmarks/results/NAME.json` or `docs/evidence/NAME.json`, has an `origin`: the commit that was measured, the
 command, the date, the sources (paths of the repository) that the figures depend on, and a hash of these sources. Once
@@ -34,12 +34,12 @@ HASH_DIGITS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """Where a result comes from."""
+    """Origin of a result."""
 
     commit: str
     """Short hash; `+` behind it: with changes that were not committed."""
     command: str
-    """What measured it, from the root of the repository; in words where it took several."""
+    """Command that measured it, from the root of the repository; in words where it took several."""
     date: str
     """Day, YYYY-MM-DD."""
     sources: tuple[str, ...]
@@ -47,11 +47,11 @@ class Origin:
     sources_hash: str
     """Of these at that commit (`sources_hash`)."""
     before: str = ""
-    """What has changed in the sources since; empty: nothing."""
+    """Changes in the sources since; empty: none."""
 
     @property
     def mark(self) -> str:
-        """What pages say beside figures of older sources; else empty."""
+        """Note beside figures of older sources on pages; else empty."""
         return f"of {self.commit}, before {self.before}" if self.before else ""
 
 
@@ -74,7 +74,7 @@ def read_result(path: Path) -> tuple[Origin, dict[str, Any]]:
 
 
 def document(origin: Origin, figures: dict[str, Any]) -> dict[str, Any]:
-    """What a result's file holds."""
+    """Content of a result's file."""
     told = {key: value for key, value in asdict(origin).items() if value != ""}
     return {ORIGIN: told, **figures}
 
@@ -91,7 +91,7 @@ def sources_hash(sources: Iterable[str], root: Path = ROOT) -> str:
 
 
 def stale(origin: Origin, root: Path = ROOT) -> bool:
-    """Whether sources have changed since, and nothing says what."""
+    """True where sources have changed since, and nothing says what."""
     return not origin.before and sources_hash(origin.sources, root) != origin.sources_hash
 
 
@@ -158,7 +158,7 @@ _SCALES = {
     "GB": (1.0, 1e-3, 2.0**-10, 1e-9),
     "MB": (1.0, 1e-6),
 }
-"""What a value of a result may be multiplied with to be the figure in that unit."""
+"""Factors from a value of a result to the figure in that unit."""
 _TIME = r"second|minute|time|(^|/|_)(ms|s|min)(/|$)"
 _KEYS = {
     "dB": r"psnr|db(/|$)",
@@ -187,7 +187,7 @@ class Figure:
     unit: str
 
     def equals(self, value: "Value") -> bool:
-        """Whether a result's value, rounded, is this figure; signs do not count. Keys of another unit rule
+        """True where a result's value, rounded, is this figure; signs do not count. Keys of another unit rule
         it out.
         """
         keys = value.keys.lower()
@@ -266,7 +266,7 @@ def quoted(name: str, root: Path = ROOT) -> list[Value]:
 
 
 def part(found: Any, keys: list[str], path: Path) -> Any:
-    """What stands in a result under one key after the other; in a list the key is a position. `_` also finds a blank."""
+    """Entry of a result under keys, one after the other; of a list by position. `_` also finds a blank."""
     for key in keys:
         try:
             if isinstance(found, list):
@@ -309,7 +309,7 @@ def unfounded(page: str, root: Path = ROOT) -> list[str]:
 
 
 def link(name: str, page: Path, root: Path = ROOT) -> str:
-    """What stands between the marks of a quoted result: a link to it, and what it is older than."""
+    """Text between the marks of a quoted result: a link to it, and what it is older than."""
     path = result_files(root)[name.split("/")[0]]
     origin, _ = read_result(path)
     target = Path(os.path.relpath(path, page.parent)).as_posix()

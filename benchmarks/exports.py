@@ -43,7 +43,7 @@ _NEAR = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class ExportsConfig:
-    """What is exported, and where the figures go."""
+    """Scenes to export, and the file of the figures."""
 
     run: Path | None = None
     """A trained run; none = fprf-lite is trained on the town first."""

@@ -35,7 +35,7 @@ PATIENCE = 10
 """Seconds for one file."""
 SEALED = ROOT / "tests" / "fuzz" / "corpus.zip"
 THIRD_PARTY = ("numpy", "torch", "cv2", "numba", "tyro", "rich", "safetensors", "kornia.color")
-"""What is imported before: only what comes after is watched, which is fprf."""
+"""Modules that are imported before: only what comes after is watched, which is fprf."""
 
 
 def inside(name: str, corpora: list[str], options: list[str]) -> None:

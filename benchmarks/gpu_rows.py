@@ -1,4 +1,4 @@
-"""What `gpu.sh` measured, as one JSON: its steps, and rows with their goals.
+"""Measurements of `gpu.sh` as one JSON: its steps, and rows with their goals.
 
     python -m benchmarks.gpu_rows WORK --output FILE
 
@@ -98,7 +98,7 @@ def rows(work: Path, form: str) -> Iterator[Row]:
 
 
 def kernels(device: torch.device) -> str:
-    """Which form of the tri-planes runs."""
+    """Name of the form of the tri-planes that runs."""
     points = torch.zeros(1, 3, device=device)
     table = torch.zeros(12, 8, device=device)
     return (

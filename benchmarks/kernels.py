@@ -1,4 +1,4 @@
-"""What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to
+"""Gain by each compiled kernel of `fprf.ops`, end to end: steps and views with one at a time switched to
 plain torch.
 
     OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels [RUN] [--data DIR] [--repeats 7]
@@ -68,7 +68,7 @@ SWITCHES: dict[str, Patches] = {
     "content and decoder joined": [(PlanesField, "colour", ContentField.colour)],
     "guided features": [(FeatureStore, "at", plain_lookups)],
 }
-"""What is replaced where a kernel is off."""
+"""Functions that are replaced where a kernel is off."""
 
 
 @contextmanager

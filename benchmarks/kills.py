@@ -41,7 +41,7 @@ from .town.write import write_town
 
 KILLED = -9
 PARTS = (blocks, prepare, style_pass, driver)
-"""What a training imports when it begins: here already, so that children start at once."""
+"""Imports of a training: here already, so that children start at once."""
 SPAN = 0.7
 """Seconds after a process's first save within which it is killed."""
 START = 1.0
@@ -158,7 +158,7 @@ def strays(run: Path) -> list[str]:
 
 
 def saving(run: Path) -> bool:
-    """Whether a checkpoint is half written."""
+    """True where a checkpoint is half written."""
     return any(name.startswith("checkpoints") for name in strays(run))
 
 

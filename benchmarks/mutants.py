@@ -1,4 +1,4 @@
-"""How many small mistakes in the mathematics the tests notice: one operator, number or clamp is changed, the
+"""Share of small mistakes in the mathematics that the tests notice: one operator, number or clamp is changed, the
 tests are run.
 
     python -m benchmarks mutants [--sample 40] [--kernels 16] [--seed 0] [--only MODULE ...] [--output mutants.json]
@@ -66,7 +66,7 @@ class Mutation(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What identifies it as long as the source is the same."""
+        """Identity, as long as the source is the same."""
         return f"{self.line}:{self.column} {self.what}"
 
 
@@ -143,7 +143,7 @@ def _is_all(node: ast.AST) -> bool:
 
 
 def _changes(node: ast.expr | ast.stmt) -> list[tuple[str, ast.AST]]:
-    """What may become of a node, each with a description."""
+    """Mutations of a node, each with a description."""
     made: list[tuple[str, ast.AST]] = []
     if isinstance(node, ast.BinOp | ast.AugAssign | ast.BoolOp) and type(node.op) in OPERATORS:
         other = OPERATORS[type(node.op)]

@@ -74,7 +74,7 @@ class PaperConfig:
     """
 
     table: Literal["ablation", "guided-filter", "clusters"] = "ablation"
-    """Which."""
+    """Name of the method."""
     data: Path = Path("town")
     """Scene folder; the town is also restyled, and judged by its truth."""
     references: tuple[Path, ...] = ()

@@ -72,7 +72,7 @@ VALUES = (
     b"1e999",
     b"123456789012",
 )
-"""What stands in the place of a number of a text."""
+"""Replacements of a number of a text."""
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?")
 NUMBERS = tuple(struct.pack("<Q", value) for value in (0, 1, 2**28, 2**31, 2**63, 2**64 - 1))
 NUMBERS += tuple(struct.pack("<d", value) for value in (0.0, -1.0, 1e300, float("nan"), float("inf")))
@@ -83,7 +83,7 @@ class Target(NamedTuple):
 
     name: str
     file: Path
-    """What is mutated; its folder holds whatever else the reader needs."""
+    """File that is mutated; its folder holds whatever else the reader needs."""
     read: Callable[[], object]
     """To the end: a scene, a config, pixels."""
     parse: Callable[[], object] | None = None
@@ -91,7 +91,7 @@ class Target(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of some rounds."""
+    """Outcome of some rounds."""
 
     rounds: int
     values: int

@@ -100,7 +100,7 @@ def _origin(path: Path) -> Origin | None:
 
 
 def _figures(path: Path) -> dict[str, Any]:
-    """What a result holds but its origin; a benchmark's own commit and command are left to that."""
+    """Content of a result without its origin; a benchmark's own commit and command are left to that."""
     if not path.is_file():
         raise UsageError(f"{path}: not there; write the figures into it first")
     found: dict[str, Any] = json.loads(path.read_text("utf-8"))

@@ -66,7 +66,7 @@ PLAIN = "no change"
 FLAT = "2d"
 """The recommended stylizer on every picture alone, as if there were no scene."""
 GLOBAL = ("reinhard", "histogram", "adain")
-"""What the recommended stylizer shall beat: colours of each picture alone, and features without regions."""
+"""Rivals of the recommended stylizer: colours of each picture alone, and features without regions."""
 STYLIZERS: Mapping[str, StylizerConfig] = {
     "adain": AdainConfig(),
     "local-adain": LocalAdainConfig(),

@@ -1,4 +1,4 @@
-"""Which encoder finds like with like: the matching rate on painted triplets, and the classes of the town in
+"""Encoders compared by finding like with like: the matching rate on painted triplets, and the classes of the town in
 every light.
 
     python -m benchmarks semantic_matching [--encoder NAME [--encoder.FIELD VALUE ...]] [--triplets DIR] [--output JSON]
@@ -378,7 +378,7 @@ GOALS = {"matching": 0.88, "match": 0.90}
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkConfig:
-    """What to measure, and on what."""
+    """Measurements and their data."""
 
     encoder: EncoderConfig = SEMANTICS
     """The semantic encoder."""

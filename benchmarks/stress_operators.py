@@ -31,7 +31,7 @@ U = 2.0**-24
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """What came of one input."""
+    """Outcome of one input."""
 
     stage: str
     input: str
@@ -44,7 +44,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the bound holds; NaN holds none."""
+        """True where the bound holds; NaN holds none."""
         if math.isnan(self.measured):
             return False
         return self.measured >= self.bound if self.at_least else self.measured <= self.bound
@@ -89,7 +89,7 @@ def scaled(found: Tensor, truth: Tensor) -> float:
 
 
 def unsound(*tensors: Tensor) -> float:
-    """How many numbers are not finite."""
+    """Count of numbers that are not finite."""
     return float(sum(int((~t.isfinite()).sum()) for t in tensors))
 
 

@@ -1,4 +1,4 @@
-"""How pictures differ in style: structure, CIEDE2000, style distance and contrast, of images [H W 3] in [0,
+"""Differences of pictures in style: structure, CIEDE2000, style distance and contrast, of images [H W 3] in [0,
 1].
 
 Structure is SSIM's second factor, of luminances that are first brought to one mean and deviation, because a

@@ -68,7 +68,7 @@ from .town.write import is_town, read_truth
 
 @dataclass(frozen=True, kw_only=True)
 class StylesConfig:
-    """What is compared, and by whom it is judged."""
+    """Comparison: scenes, styles, methods and judges."""
 
     runs: tuple[Path, ...] = ()
     """Trained runs."""
@@ -79,7 +79,7 @@ class StylesConfig:
     semantic: EncoderConfig = SEMANTICS
     """Semantic encoder of the photographs, and who finds the regions of runs."""
     triplets: int = 40
-    """How many triplets, at most, evenly spread; 0 = runs alone."""
+    """Triplets, at most, evenly spread; 0 = runs alone."""
     views: int = 4
     """Neighbouring views of each run."""
     longest: int = 256
@@ -100,7 +100,7 @@ class StylesConfig:
 
 
 class Exhibit(NamedTuple):
-    """What methods are judged by: one scene in one style. Lists of views run in parallel."""
+    """Case that methods are judged by: one scene in one style. Lists of views run in parallel."""
 
     plain: Sequence[Annotated[Tensor, "H W 3"]]
     styled: Mapping[str, Sequence[Annotated[Tensor, "H W 3"]]]
@@ -374,7 +374,7 @@ def references_of(trained: Trained, config: StylesConfig, folder: Path) -> Itera
 
 
 def town_of(trained: Trained) -> Path | None:
-    """Where the truth of a run's town lies; None where it is another scene."""
+    """Folder of the truth of a run's town; None where it is another scene."""
     folder = trained.config.data
     return folder if folder is not None and is_town(folder) else None
 

@@ -146,7 +146,7 @@ SHARE = 0.5
 
 
 def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> FieldLearner:
-    """What training takes its steps with, around a model."""
+    """Parts of a training step around a model."""
     return FieldLearner(config, prepared, model.device, model)
 
 

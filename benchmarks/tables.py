@@ -53,7 +53,7 @@ def splat_training(found: Any) -> Rows:
 
 
 def training_steps(found: Any) -> Rows:
-    """What a step of training Gaussians costs."""
+    """Cost of a step of training Gaussians."""
     yield "photograph", "Gaussians", "a step", "Gaussians and a step", "a photograph"
     for row in found["steps"]:
         size = "x".join(map(str, row["size"]))
@@ -172,7 +172,7 @@ def semantic_matching(found: Any) -> Rows:
 
 
 def gpu(found: Any) -> Rows:
-    """What a minute of a GPU gives, beside the goal."""
+    """Quality after a minute of a GPU, beside the goal."""
     yield "method", "PSNR", "goal", "SSIM", "LPIPS"
     goals = {row["name"]: row.get("goal") for row in found["rows"]}
     for method, name in (("fprf-splats", "held-out PSNR of 3D Gaussians"), ("fprf", "held-out PSNR")):

@@ -369,7 +369,7 @@ class TrainedScene:
 
 
 def _style_name(references: Sequence[Path | str]) -> str:
-    """What a style is called on a page."""
+    """Name of a style on a page."""
     return " + ".join(Path(name).stem for name in references) or "style"
 
 
@@ -380,7 +380,7 @@ class FinishedCapture:
     capture: Capture
     """The file, with what it says beside the Gaussians."""
     look: LookConfig
-    """How it is looked at before it is restyled."""
+    """Views that it is looked at from before it is restyled."""
     harmonics: Annotated[Tensor, "N K 3"] | None = None
     """New ones of all Gaussians that can be drawn, or of all; None = as they were read."""
     seen: Callable[[], Captures] | None = field(default=None, repr=False)

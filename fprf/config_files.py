@@ -43,7 +43,7 @@ class _ConfigFile(msgspec.Struct, forbid_unknown_fields=True):
     """Name, package and version of what fills each slot."""
     config: object
     schema: str = msgspec.field(name="$schema", default="")
-    """Where its schema is, for editors."""
+    """Address of its schema, for editors."""
 
 
 def save_config(path: Path, config: RunConfig, method: str) -> None:

@@ -1,4 +1,4 @@
-"""What every plug-in must do: one abstract class a kind, with shapes. The one file that a plug-in author
+"""Interfaces of plug-ins: one abstract class a kind, with shapes. The one file that a plug-in author
 reads, but for kinds of scenes.
 
 A plug-in is built by its config's `build(...)`; configs live in the `config.py` next to the built-ins and
@@ -251,7 +251,7 @@ class State(NamedTuple):
     model: Mapping[str, Tensor]
     """All that a render needs."""
     optimizer: Mapping[str, Tensor]
-    """What only further steps need: moments, counts."""
+    """State for further steps alone: moments, counts."""
 
 
 class Figures(NamedTuple):

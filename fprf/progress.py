@@ -39,7 +39,7 @@ class Report(NamedTuple):
 
 
 class Progressed(NamedTuple):
-    """How far a long piece of work is, as listeners are told."""
+    """Progress of a long piece of work, as listeners are told."""
 
     what: str
     """The step that is being taken, such as "training"."""

@@ -36,7 +36,7 @@ _MAX_IMAGE_PIXELS = 640 * 360
 
 
 class Reading(NamedTuple):
-    """How a run reads its capture, and where it is trained on."""
+    """Reading of a run's capture, and the device that it is trained on."""
 
     device: str = "cpu"
     """cpu, cuda, mps or auto."""
@@ -112,7 +112,7 @@ class RunConfig:
 
     @property
     def reading(self) -> Reading:
-        """How the capture is read, and where it is trained on."""
+        """Reading of the capture, and the device that it is trained on."""
         return Reading()
 
     def limited(self, views: int) -> int:

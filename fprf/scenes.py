@@ -1,4 +1,4 @@
-"""What every kind of scene must do: to be looked at (`Scene`, `SceneView`) and to be learnt (`SceneLearner`,
+"""Interfaces of scenes: to be looked at (`Scene`, `SceneView`) and to be learnt (`SceneLearner`,
 or `Partition` in parts).
 
 A kind of scene is a `RunConfig` (`fprf/run_config.py`) whose `build` gives a SceneLearner, and a function that
@@ -194,7 +194,7 @@ class Partition(ABC):
     @property
     @abstractmethod
     def facts(self) -> "Facts":
-        """What was found out about the whole scene, for scene.json."""
+        """Facts about the whole scene, for scene.json."""
 
     @abstractmethod
     def train(self, run: "Run", display: "Display", *, spent: float) -> None:

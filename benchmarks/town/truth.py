@@ -183,7 +183,7 @@ def short_path(start: Cameras, frames: int, stride: float = 1.0) -> Cameras:
 
 
 PARTS = {"facades": (FACADE, WINDOW, DOOR), "plants": (FOLIAGE, LAWN, TRUNK), "street": (ROAD, SIDEWALK, SKY)}
-"""What each of three references shows most of."""
+"""Main colour of each of three references."""
 _WALK = 20
 _STREET_VIEW = 9
 """The view of the walk that stands for a whole street."""

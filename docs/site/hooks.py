@@ -1,4 +1,4 @@
-"""What MkDocs is told beyond the files in docs/: the README as the first page, a page for each verb made from
+"""Additions to the files in docs/ for MkDocs: the README as the first page, a page for each verb made from
 its own flags, and files of the repository that pages link to.
 """
 
@@ -127,7 +127,7 @@ def verb_page(verb: str, about: Verb) -> str:
 
 
 def help_of(verb: str, words: list[str]) -> str:
-    """What `--help` prints."""
+    """Text that `--help` prints."""
     heard = io.StringIO()
     with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
         verb_module(verb).run([*words, "--help"])

@@ -141,7 +141,7 @@ def _asked(verb: str, rest: Sequence[str]) -> Completing | None:
 
 
 class _Place(NamedTuple):
-    """Where in the arguments the cursor is."""
+    """Position of the cursor in the arguments."""
 
     flag: str
     """The flag whose values come here; empty where there is none."""

@@ -186,7 +186,7 @@ class _Look(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Export:
-    """What every kind of file is made from. Methods write the files of one kind, if it is wanted, and return
+    """Source of every kind of file. Methods write the files of one kind, if it is wanted, and return
     their counts.
     """
 

@@ -51,7 +51,7 @@ class GalleryConfig(StyledRunConfig):
     output: Path | None = None
     """The page; by default RUN/gallery.html."""
     address: str = ""
-    """Where the page will lie on the web (https://HOST/garden.html): chats then show the picture that is written
+    """Address of the page on the web (https://HOST/garden.html): chats then show the picture that is written
     beside it.
     """
 

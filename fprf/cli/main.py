@@ -23,7 +23,7 @@ from .verbs import packaged, run_packaged
 from .verbs import verb_module as verb_module
 
 _COMPLETION = ("--complete", "--show-completion", "--install-completion")
-"""What shells ask, and what gives them their scripts."""
+"""Verbs of completion: the one that shells ask, and the one that prints their scripts."""
 _PIPE_CLOSED = 141
 """Exit status of a program that SIGPIPE ended."""
 _SPIN_ROUNDS = "1000"

@@ -22,11 +22,11 @@ _MAGIC_BYTES = 8
 
 
 class _Kind(NamedTuple):
-    """What the texts of a kind say."""
+    """Words of a kind in the texts of a package."""
 
     group: str
     summary: str
-    """What the package holds, as a phrase."""
+    """Content of the package, as a phrase."""
     try_it: str
     """A command that uses it; NAME stands for its name."""
     explained: str
@@ -84,7 +84,7 @@ class NewPluginConfig:
     name: str = ""
     """Its name on the command line: small letters, digits and hyphens; of a format, the ending of its files."""
     kind: Kind = "encoder"
-    """What it is; docs/plugins.md lists the other kinds, which begin as one of these."""
+    """Example of one kind of plug-in; docs/plugins.md lists the other kinds, which begin as one of these."""
     output: Path | None = None
     """Folder of the package, new or empty; by default fprf-NAME."""
 

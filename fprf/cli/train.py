@@ -14,7 +14,7 @@ from ..plugins import registry
 from .parsing import first_line, load_method, parse, read_paths
 
 DEFAULT_METHOD = "fprf-splats"
-"""Where none is named: the best quality for the time on every capture that was measured
+"""Method where none is named: the best quality for the time on every capture that was measured
 (docs/measurements.md).
 """
 VIEW = "--view"

@@ -247,7 +247,7 @@ class RayBatches(DataManager):
         return chosen
 
     def _source_of(self) -> _Source:
-        """What batches are drawn from: all pixels, those of sky, and those that show points."""
+        """Pixels that batches are drawn from: all, those of sky, and those that show points."""
         skies = self._scene.sky_masks if self._config.masks else ()
         sky = self._runs(skies, unmasked=False) if skies else None
         marked = None

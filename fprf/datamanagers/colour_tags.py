@@ -21,7 +21,7 @@ from ..io.transfer import ADOBE_GAMMA, ADOBE_RGB, BT709, SRGB, Chromaticities, C
 
 
 class ColourTag(NamedTuple):
-    """What a file says of its colours."""
+    """Colours of a file, as it says."""
 
     space: ColourSpace = SRGB
     full_range: bool = True
@@ -31,7 +31,7 @@ class ColourTag(NamedTuple):
     bits: int = 8
     """Bits of a channel, where the file's boxes say so."""
     unknown: str = ""
-    """What the file says that no colours are known for, in words; it is read as sRGB."""
+    """Tags that no colours are known for, in words; it is read as sRGB."""
 
     @property
     def changes(self) -> bool:
@@ -46,7 +46,7 @@ _SAME_GAMMA = 0.05
 _SRGB_GAMMA = 2.2
 """Exponent that stands for the curve of sRGB in gAMA (PNG, section 11.3.2.5: sRGB is written as 45455)."""
 _PNG_UNIT = 100_000
-"""What 1 is in gAMA and cHRM."""
+"""Unit of gAMA and cHRM."""
 _MAX_BOXES = 20_000
 """Boxes of an AVIF or HEIC file that are read; pictures of 100 million pixels have hundreds."""
 _MAX_HEADER_BYTES = 64 << 20

@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingPixels:
-    """What batches are drawn from."""
+    """Source of batches."""
 
     scene: ParsedScene
     seen: Callable[[int], Tensor] | None = None
-    """Which pixels [H W] of a training view batches are drawn from, for a block of a larger scene; None = all."""
+    """Pixels [H W] of a view that batches are drawn from, for a block of a larger scene; None = all."""
     background: tuple[float, float, float] | None = None
     """Colour that transparent pixels show, RGB in [0, 1]; None = white."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureTargets:
-    """What the features of a batch are made with."""
+    """Maker of the features of a batch."""
 
     content: Encoder | None = None
     semantic: Encoder | None = None

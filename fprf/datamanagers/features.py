@@ -225,7 +225,7 @@ class FeatureStore:
 
 
 class Projection(NamedTuple):
-    """What features are projected on before they are kept."""
+    """Basis that features are projected on before they are kept."""
 
     dim: int
     """Principal components; fewer, where the encoder has fewer."""

@@ -272,7 +272,7 @@ def decode(path: Path, *, upright: bool, rounded: Rounding = np.rint, convert: b
 
 
 def colour_note(path: Path) -> str:
-    """What is decided about the colours of a file, in one clause; empty where nothing is. Raises DataError as
+    """Decision about the colours of a file, in one clause; empty where nothing is. Raises DataError as
     `read_header` does.
     """
     with opened(path) as file:
@@ -302,7 +302,7 @@ def _check_size(path: Path, kind: str, image: ImageFile) -> None:
 
 
 def _tag_of(kind: str, file: IO[bytes], image: ImageFile) -> ColourTag:
-    """What the file says of its colours beside an ICC profile."""
+    """Colours of the file beside an ICC profile, as it says."""
     if kind == "PNG":
         tag = png_tag(file)
     elif kind in ("AVIF", "HEIC"):

@@ -92,7 +92,7 @@ class Cutout(NamedTuple):
     pixels: Image
     """Colours of the file, straight: not mixed with anything. Those of transparent pixels mean nothing."""
     opaque: Annotated[NDArray[np.bool_], "H W"] | None
-    """Which pixels count; None = all."""
+    """Pixels that count; None = all."""
 
 
 def load_image(
@@ -202,7 +202,7 @@ def has_transparency(path: Path) -> bool:
 
 
 def transparent_fault(path: Path) -> str:
-    """What is wrong with an image that is transparent all over, or nearly; empty for others. Raises DataError
+    """Fault of an image that is transparent all over, or nearly; empty for others. Raises DataError
     as `load_image` does.
     """
     if not read_header(path).alpha:
@@ -216,7 +216,7 @@ def transparent_fault(path: Path) -> str:
 
 
 def colour_notes(paths: Sequence[Path]) -> list[str]:
-    """What is decided about the colours of photographs, a line for each kind; those that cannot be read are left
+    """Decisions about the colours of photographs, a line for each kind; those that cannot be read are left
     to who reads them.
     """
     alike: dict[str, list[str]] = {}
@@ -261,7 +261,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
 
 
 def _mask_values(grey: NDArray[np.uint8], alpha: PIL.Image.Image | None) -> NDArray[np.uint8]:
-    """What decides in a mask: what varies of alpha and luminance, in this order; else the darker of both."""
+    """Channel that decides in a mask: the first of alpha and luminance that varies, else the darker of both."""
     if alpha is None:
         return grey
     opaque = np.asarray(alpha)
@@ -407,7 +407,7 @@ def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
 
 
 def _fault(path: Path) -> str:
-    """What is wrong with a reference photograph; empty for a good one."""
+    """Fault of a reference photograph; empty for a good one."""
     try:
         load_cutout(path)
     except DataError as error:

@@ -1,4 +1,4 @@
-"""Which file is the mask of which photograph, by names: one rule for scene folders, `fprf process` and references.
+"""Masks of photographs by their names: one rule for scene folders, `fprf process` and references.
 
 A mask of images/a/0001.jpg is, the best first:
 
@@ -25,7 +25,7 @@ from .picture_names import MASK_WORDS, SKY_WORDS, numbered, spelling, without_su
 
 
 class MaskKind(NamedTuple):
-    """What masks show, as their folders and files are called."""
+    """Subjects of masks, by the names of their folders and files."""
 
     folder: str
     folders: re.Pattern[str]
@@ -39,12 +39,12 @@ SKY = MaskKind("sky_masks", re.compile(r"skymasks?\d*"), SKY_WORDS)
 
 
 class FoundMasks(NamedTuple):
-    """What was found for some photographs."""
+    """Masks of some photographs."""
 
     masks: tuple[Path | None, ...]
     """A mask for each; None = none. Empty where there is none for any."""
     notes: list[str]
-    """What does not fit, one line for each kind of masks."""
+    """Misfits, one line for each kind of masks."""
 
 
 def match_masks(

@@ -1,4 +1,4 @@
-"""Which files of a folder are photographs of the scene: without thumbnails, reduced copies, maps, masks, what
+"""Files of a folder that are photographs of the scene: without thumbnails, reduced copies, maps, masks, what
 other programs hide, and copies of a photograph under another name.
 
 What is left out has a line for each kind, with the count and an example. Nothing that differs from all others is
@@ -122,7 +122,7 @@ def _without(
 
 
 def _kind_of_path(path: PurePath) -> str:
-    """What a file is by the names of its folders and by its own first letter; empty for a photograph."""
+    """Kind of a file by the names of its folders and its own first letter; empty for a photograph."""
     folders = []
     for part in path.parts[:-1]:
         folders.append(spelling(part))

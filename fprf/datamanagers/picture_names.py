@@ -1,4 +1,4 @@
-"""What names say of pictures that belong to a photograph: its masks, maps of it, thumbnails.
+"""Names of pictures that belong to a photograph: its masks, maps of it, thumbnails.
 
 Names are compared by their spelling: in Unicode's normal form (macOS), without case and outer blanks.
 """
@@ -46,7 +46,7 @@ def numbered(stem: str) -> str:
 
 
 def without_words(stem: str, words: str) -> Iterator[str]:
-    """What is left of a spelled stem without words before or behind it, and numbers about those: of
+    """Rest of a spelled stem without words before or behind it, and numbers about those: of
     a_0_mask_1 that is a_0, then a. Nothing where it has none of the words.
     """
     behind = re.fullmatch(rf"(.+?){_SEPARATORS}{words}(?:{_SEPARATORS}\d+)*", stem)

@@ -75,7 +75,7 @@ def raw_kind(head: bytes, directories: list[ImageFileDirectory_v2]) -> str:
 
 
 def raw_exif(file: IO[bytes]) -> PIL.Image.Exif:
-    """What a raw photograph that is a TIFF says of its lens: model and focal lengths; empty for others."""
+    """Lens of a raw photograph that is a TIFF: model and focal lengths; empty for others."""
     exif = PIL.Image.Exif()
     directories = tiff_directories(file)
     if not directories:

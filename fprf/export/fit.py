@@ -64,7 +64,7 @@ def seen_points(maps: Maps, most: int) -> Points:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How long and how many Gaussians are fitted, and before what."""
+    """Length of the fit, count of Gaussians, and their background."""
 
     minutes: float
     """Time for the geometry, after rendering; a further look gets a share of it."""

@@ -171,7 +171,7 @@ def vertex_colours(maps: Maps, mesh: Mesh) -> Annotated[Tensor, "N 3"]:
 def _gaps(
     maps: Maps, view: int, point: Annotated[Tensor, "P 3"]
 ) -> tuple[Tensor, Tensor, Annotated[Tensor, "P 2"]]:
-    """How far points lie before the surface that a view sees there [P], their distance [P], and their pixels.
+    """Gaps of points before the surface that a view sees there [P], their distances [P], and their pixels.
 
     Infinite where the view sees nothing, NaN outside of it; negative where something hides the point.
     """

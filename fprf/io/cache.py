@@ -66,7 +66,7 @@ def refusal(folder: Path) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """What the system says, without the name of a file; of a WriteError, that of its cause."""
+    """Words of the system, without the name of a file; of a WriteError, that of its cause."""
     number = getattr(error.__cause__ or error, "errno", None)
     return os.strerror(number) if number else str(error)
 

@@ -1,4 +1,4 @@
-"""Whether a file may be written: nothing that is read, and nothing of another origin, is replaced unasked.
+"""Check before a file is written: nothing that is read, and nothing of another origin, is replaced unasked.
 
 The origin of an output is the verb that writes it and the files and folders that the verb reads; other settings do
 not count. A folder that outputs were written to holds a list of them, `.fprf.json`: for each its origin as a hash,
@@ -30,7 +30,7 @@ _RECORD_FORMAT = 1
 """Counts up when an older fprf could not read the list."""
 
 _Entry: TypeAlias = dict[str, Any]
-"""What the list says of a file; one that is announced, and not yet written, has no size."""
+"""Entry of the list for a file; one that is announced, and not yet written, has no size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class Origin:
     overwrite: bool = False
     """Everything may be replaced."""
     remedy: str = "name another --output, or replace it with --overwrite true"
-    """What a refusal asks for."""
+    """Remedy that a refusal names."""
 
     def refusal(self, path: Path) -> str | None:
         """Why a file may not be written, as a sentence; None where it may."""

@@ -104,7 +104,7 @@ _ROWS_AT_ONCE = 256
 
 @dataclass(frozen=True, kw_only=True)
 class ColourSpace:
-    """What RGB signals mean."""
+    """Meaning of RGB signals."""
 
     primaries: Chromaticities = BT709
     """CIE 1931 x, y of red, green, blue and white."""

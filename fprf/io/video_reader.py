@@ -65,7 +65,7 @@ _DEEP_BITS = (b"\x0a", b"\x0c", b"\x10")
 
 @dataclass
 class VideoLog:
-    """What a video says of itself, and what has been read of it so far."""
+    """Description of a video by its file, and counts of what has been read so far."""
 
     path: Path
     expected: int = 0
@@ -79,7 +79,7 @@ class VideoLog:
     skipped: int = 0
     """Frames that the container itself leaves out, as after a cut in a phone."""
     notes: list[str] = field(default_factory=list)
-    """What was decided: colours, shape of pixels, interlacing."""
+    """Decisions: colours, shape of pixels, interlacing."""
 
     @property
     def missing(self) -> int:
@@ -90,7 +90,7 @@ class VideoLog:
         return max(self.damaged, promised - self.read)
 
     def sentence(self) -> str:
-        """What was expected and what was read, in one line."""
+        """Expected and read frames, in one line."""
         if not self.missing:
             return f"{self.path.name}: all of its {self.read} frames were read"
         about = "" if self.exact else "about "
@@ -124,7 +124,7 @@ class VideoFrame(ABC):
 
 
 def read_video(path: Path) -> tuple[VideoLog, Iterator[VideoFrame]]:
-    """What a video says of itself, and its frames; the log is complete when these have been gone through.
+    """Description of a video and its frames; the log is complete when these have been gone through.
 
     Raises DataError where the file is empty, cannot be opened, or holds no video, here or at the first frame.
     """
@@ -178,7 +178,7 @@ def square_size(width: int, height: int, ratio: Fraction) -> tuple[int, int]:
 
 
 def _shape_of_pixels(log: VideoLog, given: Fraction | None, width: int, height: int) -> Fraction:
-    """How many times as wide as high pixels are; 1 where the file says nothing, or what cannot be."""
+    """Width of pixels over their height; 1 where the file says nothing, or what cannot be."""
     if given is None or given <= 0 or given == 1:
         return Fraction(1)
     if not Fraction(1, _MAX_PIXEL_RATIO) <= given <= _MAX_PIXEL_RATIO:
@@ -298,7 +298,7 @@ class _AvFrame(VideoFrame):
         return _BT601_NUMBER
 
     def _space(self) -> ColourSpace:
-        """What the RGB signals of the frame mean."""
+        """Meaning of the frame's RGB signals."""
         context = self._stream.codec_context
         primaries = int(context.color_primaries)
         curve = int(context.color_trc)

@@ -49,7 +49,7 @@ class SunConfig:
     views show is lit.
     """
     sun_strength: float = 1.0
-    """How far this light takes the place of the captured one, in [0, 1]: at 0 colours stay bit for bit."""
+    """Share of this light in the place of the captured one, in [0, 1]: at 0 colours stay bit for bit."""
     sun_colour: str | None = None
     """Colour of the sun: #RRGGBB, or kelvin such as 3500K. none = by its elevation."""
     sky_colour: str | None = None

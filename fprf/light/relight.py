@@ -46,7 +46,7 @@ _LUMA = (0.2126, 0.7152, 0.0722)
 
 
 class Received(NamedTuple):
-    """What N Gaussians receive."""
+    """Light that N Gaussians receive."""
 
     normals: Annotated[Tensor, "N 3"]
     sure: Annotated[Tensor, "N"]

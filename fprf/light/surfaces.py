@@ -40,14 +40,14 @@ _MAX_DISTANCE = 1000.0
 
 
 class Surfaces(NamedTuple):
-    """Where N Gaussians are seen."""
+    """Surfaces of N Gaussians."""
 
     points: Annotated[Tensor, "N 3"]
     """Points of the surface that they show; their means, where no view shows them."""
     normals: Annotated[Tensor, "N 3"]
     """Unit normals, out of the surface."""
     sure: Annotated[Tensor, "N"]
-    """How far the normals of all pixels that show a Gaussian agree, in [0, 1]; 0 where no view shows it."""
+    """Agreement of the normals of all pixels that show a Gaussian, in [0, 1]; 0 where no view shows it."""
     widths: Annotated[Tensor, "N"]
     """Width of the view where they are: of what size details can be told there."""
     weights: Annotated[Tensor, "N"]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .threads import cached_jit, take
 
 MIN_ALPHA = 1 / 255
-"""What takes away less counts as nothing, as in the rasteriser."""
+"""Opacity below which a Gaussian counts as nothing, as in the rasteriser."""
 MAX_POWER = 11.1
 """2 ln 255: beyond it even an opaque Gaussian takes away less than MIN_ALPHA."""
 MAX_ALPHA = 0.99
@@ -53,7 +53,7 @@ class Lists(NamedTuple):
     """Gaussians in each cell, from the highest on."""
 
     starts: NDArray[np.int64]
-    """Where the list of each cell begins, and the last one ends [cells + 1]."""
+    """Beginnings of the lists of cells, and the end of the last [cells + 1]."""
     ids: NDArray[np.int32]
     rows: NDArray[np.float32]
     """The Gaussians [N COLUMNS]."""

@@ -34,18 +34,18 @@ class Lighting:
         self._scene = scene
         self._order = order
         self.found: Illumination | None = None
-        """What takes seconds to find."""
+        """Findings that take seconds."""
         self._draft: Illumination | None = None
         self._every = math.ceil(len(order) / _MAX_MOVING_GAUSSIANS)
 
     def find(self) -> Illumination:
-        """What is found out about the scene, once."""
+        """Findings about the scene, made once."""
         if self.found is None:
             self.found = self._scene.light_found
         return self.found
 
     def surfaces(self) -> bytes:
-        """What browsers need, whatever the light: a head and planes of bytes."""
+        """Data for browsers, whatever the light: a head and planes of bytes."""
         illumination = self.find()
         hours: list[dict[str, Any]] = []
         for hour in day(_SHOWN_SUNS, getattr(illumination, "azimuth", 0.0)):
@@ -100,11 +100,11 @@ class Lights:
         self._made: dict[str, tuple[int, bytes]] = {}
 
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
-        """What a new client has to know."""
+        """Messages for a new client."""
         return [_message(name, version) for name, (version, _) in [*self._made.items()]]
 
     def surfaces(self) -> bytes:
-        """What browsers need for all lights."""
+        """Data of all lights for browsers."""
 
         def made() -> bytes:
             self._prepare()

@@ -37,7 +37,7 @@ Slider: TypeAlias = Literal[
 
 
 class Camera(Struct, forbid_unknown_fields=True, frozen=True):
-    """Where a client stands, in the scene's coordinates."""
+    """Camera of a client, in the scene's coordinates."""
 
     place: Vector
     axes: tuple[Vector, Vector, Vector]
@@ -101,14 +101,14 @@ class Pick(Message, tag="pick"):
 
 
 class Region(Message, tag="region"):
-    """What the picked region takes; `close` picks none."""
+    """Rule of the picked region; `close` picks none."""
 
     action: Literal["pin", "forbid", "keep", "free", "close"]
     card: Count | None = None
 
 
 class Map(Message, tag="map"):
-    """What is shown in the place of colours."""
+    """Map in the place of colours."""
 
     map: Literal["none", "matches", "regions"]
 
@@ -123,7 +123,7 @@ class Keep(Message, tag="keep"):
 
 
 class Undo(Message, tag="undo"):
-    """What was made last is undone, or done again."""
+    """Undo what was made last, or do it again."""
 
     again: bool = False
 

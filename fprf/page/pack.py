@@ -253,7 +253,7 @@ def colour_section(colours: Colours, level: int = 9) -> bytes:
 
 
 def header(packed: Packed) -> dict[str, Any]:
-    """What the page has to know to read the sections."""
+    """Header of the sections, for the page."""
     return {
         "count": len(packed.order),
         "harmonics": packed.palette.shape[1] + 1,
@@ -263,7 +263,7 @@ def header(packed: Packed) -> dict[str, Any]:
 
 
 def colour_header(colours: Colours) -> dict[str, Any]:
-    """What the page has to know to read a style."""
+    """Header of a style, for the page."""
     return {"low": colours.low.tolist(), "high": colours.high.tolist(), "maps": len(colours.maps)}
 
 

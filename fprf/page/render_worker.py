@@ -20,7 +20,7 @@ Steps: TypeAlias = Generator[None, None, T]
 
 
 class _Order(enum.IntEnum):
-    """Which work is done first."""
+    """Order of work."""
 
     JOB = 0
     CLIENT = 1

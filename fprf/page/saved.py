@@ -1,4 +1,4 @@
-"""What users made of a scene on its page, kept in the scene's folder: photographs, looks, keyframes.
+"""Work of users on a scene's page, kept in the scene's folder: photographs, looks, keyframes.
 
 `page/page.json` is a `PageFile`; `page/photographs/HASH.png` are the photographs as `uploads` wrote them, by
 the hash of their bytes. A scene's folder can hold pages of several files of Gaussians: page, page-2, and so on.
@@ -107,7 +107,7 @@ def folder_of(root: Path, of: str) -> Path:
 
 
 def read_page(folder: Path) -> PageFile | None:
-    """What a folder keeps; None where it keeps nothing. Raises DataError for a page.json that is none of ours."""
+    """Content of a folder, or None. Raises DataError for a page.json that is none of ours."""
     path = folder / _DOCUMENT
     try:
         data = path.read_bytes()
@@ -134,7 +134,7 @@ def digest_of(data: bytes) -> str:
 
 
 def made_of(page: PageFile, photographs: Mapping[str, Photograph]) -> Made:
-    """What was made, with photographs by their hash; of looks the photographs that are not among them are left
+    """Work of users, with photographs by their hash; of looks the photographs that are not among them are left
     out. Raises ConfigError for a style that this version does not know.
     """
 

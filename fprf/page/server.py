@@ -109,7 +109,7 @@ class ViewerServer:
         self._clients: dict[Hashable, Client] = {}
         self._numbers = count(1)
         self._waits: dict[str, Mapping[str, Any]] = {}
-        """What takes its time now, which a new page is told too."""
+        """Waits of now, which a new page is told too."""
         self._uploads = asyncio.Semaphore(_MAX_RECEIVED_BODIES)
         self._loop: asyncio.AbstractEventLoop | None = None
         try:
@@ -489,7 +489,7 @@ def _line(error: Exception) -> str:
 
 
 def _file_name(shown: str) -> str:
-    """What a saved file of a look is called, beside its scene."""
+    """Name of a saved file of a look, beside its scene."""
     if shown == "Now":
         return "restyled"
     return "".join(c if c.isalnum() or c in "-_" else "-" for c in shown).strip("-").lower() or "look"

@@ -183,7 +183,7 @@ class Session:
         self.tell("restoring", "", None)
 
     def _renumbered(self, made: Made, regions: Regions) -> Made:
-        """What was made, with the regions that it speaks of as they are numbered now."""
+        """Work of users, with the regions that it speaks of as they are numbered now."""
         now = self.restyler.encoders.scene_style
         before = regions_before(regions, now)
         if before is None:
@@ -243,7 +243,7 @@ class Session:
             self.geometry = container(about(scene.cameras, home, lambda view: 1.5 * spread), {})
 
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
-        """What a new client has to know."""
+        """Messages for a new client."""
         drawn_there = isinstance(self.viewed.scene, SplatScene)
         viewed = self.viewed
         scene = {

@@ -97,7 +97,7 @@ class Start:
         self._preview_lock = threading.Lock()
         self._pictures: dict[tuple[Path, int], bytes] = {}
         self._previews: dict[str, Path] = {}
-        """Where scenes of the list lie, by name."""
+        """Folders of the scenes in the list, by name."""
         self._progress = StartProgress()
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
@@ -121,7 +121,7 @@ class Start:
             self._decoder.close()
 
     def state(self) -> dict[str, Any]:
-        """How far it is, as the page reads it; idle, what can be opened."""
+        """Progress as the page reads it, and when idle what can be opened."""
         progress = self._progress
         recent = self._recent() if progress.stage == "idle" else []
         return {

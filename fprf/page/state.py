@@ -202,7 +202,7 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """What users have made of a scene: it can be undone, and is kept in the scene's folder."""
+    """Work of users on a scene: it can be undone, and is kept in the scene's folder."""
 
     shelf: tuple[Photograph, ...] = ()
     look: Look = field(default_factory=Look)
@@ -236,7 +236,7 @@ class Made:
 
 
 class History:
-    """What was made before each change, and what was undone. Changes of one control are one step."""
+    """History of what was made: before each change, and undone. Changes of one control are one step."""
 
     def __init__(self) -> None:
         self.before: list[Made] = []
@@ -254,11 +254,11 @@ class History:
             del self.before[0]
 
     def undo(self, now: Made) -> Made:
-        """What there was before the last change. Raises UsageError where there was none."""
+        """Work before the last change. Raises UsageError where there was none."""
         return self._moved(self.before, self.after, now, "undo: nothing was changed")
 
     def redo(self, now: Made) -> Made:
-        """What was undone last. Raises UsageError where nothing was."""
+        """Work that was undone last. Raises UsageError where nothing was."""
         return self._moved(self.after, self.before, now, "redo: nothing was undone")
 
     def _moved(self, source: list[Made], other: list[Made], now: Made, fault: str) -> Made:
@@ -414,7 +414,7 @@ class SharedState(Made):
         return replace(self, shelf=shelf, look=self.look.weighted(photograph, 0.0, shelf))
 
     def changed(self, message: messages.Change) -> "SharedState":
-        """What a control of the page makes of the state. Raises UsageError or ConfigError for what is not
+        """State after a control of the page. Raises UsageError or ConfigError for what is not
         possible.
         """
         look = self.look

@@ -61,7 +61,7 @@ class Suns:
 
     @property
     def header(self) -> dict[str, Any]:
-        """What the page has to know to read the section."""
+        """Header of the section, for the page."""
         return {
             **self.head,
             "day": [light.head for light in self.day],
@@ -80,7 +80,7 @@ def packed_surfaces(illumination: Illumination) -> Annotated[NDArray[np.uint8], 
 
 
 def surfaces_header(illumination: Illumination, gaussians: Gaussians) -> dict[str, Any]:
-    """What the page has to know of surfaces, whatever the light."""
+    """Data of surfaces for the page, whatever the light."""
     fit = None
     if bool(illumination.sky.any()):
         fit = illumination.captured_sky(gaussians).fit.tolist()

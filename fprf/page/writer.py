@@ -51,13 +51,13 @@ _PACKING_SHARE = 0.5
 _MAX_SEEN_CAMERAS = 256
 """Cameras that say what was photographed, at most; by eye: frames of neighbours overlap."""
 _PHOTOGRAPHS_FILL = 0.75
-"""How far a stage of another format is filled, from 0 (all of a photograph is seen) to 1 (nothing beyond it is);
+"""Filling of a stage of another format, from 0 (all of a photograph is seen) to 1 (nothing beyond it is);
 by eye. Views of captures show whole objects.
 """
 _REACH_RATIO = 1.6
-"""How far one may go from the middle of the cameras, relative to the farthest of them; by eye."""
+"""Distance that one may go from the middle of the cameras, relative to the farthest of them; by eye."""
 _REACH_DEPTHS = 0.5
-"""How much farther, in the median distance of what is looked at; by eye."""
+"""Addition to it, in the median distance of what is looked at; by eye."""
 _FITTED_SHARE = 0.98
 """Share kept of the Gaussians that would fit by the mean: what shows most compresses least."""
 _MAX_FITTING_ROUNDS = 16
@@ -100,12 +100,12 @@ class PageView(NamedTuple):
     name: str
     original: Picture
     photograph: Picture | None = None
-    """What a camera saw there."""
+    """View of a camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """What a page shows. Names, `lead` and `credits` are shown as text, whatever they hold."""
+    """Content of a page. Names, `lead` and `credits` are shown as text, whatever they hold."""
 
     title: str
     lead: str = ""
@@ -123,7 +123,7 @@ class Page:
     """Suns of a day that falls on the Gaussians, where there are any; 0 = none."""
     credits: Sequence[str] = ()
     address: str = ""
-    """Where it will lie on the web (https://…/garden.html): chats show the picture beside it."""
+    """Address on the web (https://…/garden.html): chats show the picture beside it."""
 
 
 def preview_of(path: Path) -> Path:
@@ -147,7 +147,7 @@ def write_page(path: Path, page: Page, *, megabytes: float | None = None) -> int
 
 
 def shown_of(shown: int, captured: int) -> str:
-    """How many Gaussians a page shows, in words."""
+    """Count of Gaussians on a page, in words."""
     if shown == captured:
         return f"{shown:,}"
     return f"{shown:,} of {captured:,}"

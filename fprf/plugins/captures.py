@@ -1,4 +1,4 @@
-"""Which files are captures of Gaussians, by their names alone: the entry points of formats. Imports none of them."""
+"""Captures of Gaussians among files, by their names alone: the entry points of formats. Imports none of them."""
 
 from pathlib import Path
 

@@ -280,7 +280,7 @@ _JSON_KINDS = {
     dict: "an object",
     list: "a list",
 }
-"""What messages call the kinds of JSON."""
+"""Names of the kinds of JSON in messages."""
 
 
 def packages_of(config: object) -> dict[str, str]:

@@ -355,7 +355,7 @@ def _lost_by_lens(place: SceneFolder, state: State, models: list[dict[str, Any]]
 def _compare_lenses(
     place: SceneFolder, state: State, config: SfmConfig, progress: Progress, models: Path
 ) -> Trial:
-    """How the images of the main one of some models are best grouped by lens."""
+    """Best grouping by lens of the images of the main one of some models."""
     result = place.work / "lenses.result.json"
 
     def solved() -> int:

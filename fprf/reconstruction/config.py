@@ -1,4 +1,4 @@
-"""How poses are found: the knobs of `fprf process`. No cv2, no torch."""
+"""Configuration of `fprf process`, which finds poses. No cv2, no torch."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Which images were taken with one lens, where no EXIF block says so, as after a messenger.
+"""Images that were taken with one lens, where no EXIF block says so, as after a messenger.
 
 All images of one size share a lens at first. Then every image gets a focal length of its own in a bundle
 adjustment of some points: two phones show as two clusters of focal lengths. Images are grouped by these clusters,
@@ -59,7 +59,7 @@ class Grouping:
 
     @property
     def count(self) -> int:
-        """How many lenses there are."""
+        """Count of lenses."""
         return len(set(self.lenses.values()))
 
 
@@ -98,7 +98,7 @@ def unsaid_lenses(images: Images) -> list[str]:
 
 
 def unsaid_sentence(images: Images) -> str:
-    """What is not known of the lenses of images without EXIF, in one line; empty where all say theirs."""
+    """Unknowns about the lenses of images without EXIF, in one line; empty where all say theirs."""
     unsaid = unsaid_lenses(images)
     if not unsaid:
         return ""
@@ -196,7 +196,7 @@ def cluster_values(
 
 
 def _best_edges(ordered: Annotated[NDArray[np.float64], "N"], count: int) -> list[int]:
-    """Where the clusters of sorted values begin, and the end of the last, by dynamic programming."""
+    """Beginnings of the clusters of sorted values, and the end of the last, by dynamic programming."""
     total = len(ordered)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
     # costs[j]: of the best clusters of the first j values; starts[k][j]: where the last of k + 1 of them begins.
@@ -251,7 +251,7 @@ def better_models(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[s
 
 
 def lens_sentence(trial: Trial, before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
-    """What was decided about lenses, in one line; `before` and `after` are reconstructions."""
+    """Decision about lenses, in one line; `before` and `after` are reconstructions."""
     focal: dict[str, list[float]] = {}
     for name, lens in trial.grouping.lenses.items():
         if name in trial.focal:

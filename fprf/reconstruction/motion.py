@@ -1,4 +1,4 @@
-"""Whether anything moves from image to image, by the verified matches in COLMAP's database."""
+"""Motion from image to image, by the verified matches in COLMAP's database."""
 
 import contextlib
 import sqlite3

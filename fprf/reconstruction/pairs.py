@@ -1,4 +1,4 @@
-"""Which pairs of images are matched: in order, or those that share features.
+"""Pairs of images to match: in order, or those that share features.
 
 How many features two images share is estimated before they are matched by their largest ones alone (preemptive
 matching: Wu, Towards Linear-Time Incremental Structure from Motion, 2013): 300 of each take a third of a
@@ -61,8 +61,8 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 
 def shared_features(images: Sequence[Descriptors], progress: Callable[[int, int], None]) -> Shared:
-    """How many descriptors of any two images are nearest to one another, and clearly nearer than the next; 0 of an
-    image with itself. `progress` is told (images done, all).
+    """Counts of descriptors of any two images that are nearest to one another, and clearly nearer than the next;
+    0 of an image with itself. `progress` is told (images done, all).
     """
     units = []
     for descriptors in images:

@@ -69,7 +69,7 @@ class State:
     masks: dict[str, str] = field(default_factory=dict)
     """Hashes of the masks by image; empty without."""
     notes: dict[str, list[str]] = field(default_factory=dict)
-    """What was decided, by the step that decided it."""
+    """Decisions, by the step that made them."""
 
     @classmethod
     def load(cls, place: SceneFolder) -> "State":

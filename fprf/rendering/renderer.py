@@ -188,7 +188,7 @@ def composite_mean(
 
 
 class TrainingStep(NamedTuple):
-    """What rendering is told in training."""
+    """Arguments of rendering in training."""
 
     step: int | None = None
     """None = what is rendered is only shown: samples are drawn as they are for views."""

@@ -45,7 +45,7 @@ _CHUNK_ROWS = 1 << 17
 
 @dataclass(frozen=True)
 class Activation:
-    """Which numbers of a file look activated, or are read so."""
+    """Numbers of a file that look activated, or are read so."""
 
     opacities: bool = False
     sizes: bool = False
@@ -56,7 +56,7 @@ class Activation:
         return self.opacities or self.sizes or self.colours > 0
 
     def __str__(self) -> str:
-        """What is activated, as a phrase."""
+        """Activated numbers, as a phrase."""
         parts = []
         if self.opacities:
             parts.append("opacities all in [0, 1]")
@@ -68,7 +68,7 @@ class Activation:
 
 
 def find_activation(gaussians: Gaussians, *, asked: bool = False) -> Activation:
-    """Which numbers of Gaussians, as they were read, look activated. `asked`: somebody says so, and what may
+    """Numbers of Gaussians, as they were read, that look activated. `asked`: somebody says so, and what may
     be either is taken so, such as colours of one grey.
     """
     if len(gaussians) < _MIN_GAUSSIANS and not asked:
@@ -128,14 +128,14 @@ def nearest_distance(points: Annotated[Tensor, "N 3"]) -> float | None:
 
 
 def _within(values: Tensor, most: float) -> bool:
-    """Whether there are values, all of which are in [0, most]."""
+    """True where there are values, all of them in [0, most]."""
     if not len(values):
         return False
     return float(values.min()) >= -_ROUNDING and float(values.max()) <= most + _ROUNDING
 
 
 def _are_sizes(gaussians: Gaussians) -> bool:
-    """Whether ln-scales are sizes: none is negative, and as sizes they suit the distances of neighbours
+    """True where ln-scales are sizes: none is negative, and as sizes they suit the distances of neighbours
     better. Captures in millimetres have ln-scales above 0, too.
     """
     scales = gaussians.log_scales

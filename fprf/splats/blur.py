@@ -1,4 +1,4 @@
-"""Which photographs are blurred: each is compared with those that were taken near by."""
+"""Blurred photographs: each is compared with those that were taken near by."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor

@@ -38,7 +38,7 @@ class _Side(NamedTuple):
     colours: Annotated[Tensor, "N 3"]
     """Logarithms, of colours + 0.055."""
     weights: Annotated[Tensor, "N"]
-    """What can be seen counts, by its opacity."""
+    """Weights by what can be seen, its opacity."""
 
     def in_cells(
         self, cells: Annotated[Tensor, "N"], count: int

@@ -71,7 +71,7 @@ by less.
 
 
 def direction_up(capture: Capture) -> tuple[Direction, str]:
-    """What points up in a capture, as its file says or as its ground shows, and what tells it, in words."""
+    """Direction up in a capture, as its file says or as its ground shows, and what tells it, in words."""
     if capture.up is not None:
         return capture.up, capture.up_reason or "the file says so"
     ground = find_ground(capture.gaussians.drawable())
@@ -82,7 +82,7 @@ def direction_up(capture: Capture) -> tuple[Direction, str]:
 
 
 def with_direction_up(look: LookConfig, capture: Capture, say: Callable[[str], None]) -> LookConfig:
-    """How a capture is looked at, with a direction up, which is said where it was not asked for."""
+    """Views of a capture with a direction up, which is said where it was not asked for."""
     if look.up is not None:
         return look
     up, reason = direction_up(capture)
@@ -182,7 +182,7 @@ def open_capture(
 
 
 class _Findings(NamedTuple):
-    """What is found out about a capture, as the cache keeps it."""
+    """Findings about a capture, as the cache keeps them."""
 
     cameras: Cameras
     semantics: Semantics
@@ -197,7 +197,7 @@ def _cache_name(capture: Capture, look: LookConfig, encoder: Encoder) -> str:
 
 
 def _load_findings(path: Path, count: int, say: Callable[[str], None]) -> _Findings | None:
-    """What the cache keeps of a capture of `count` Gaussians; None where it keeps nothing, or nothing sound."""
+    """Findings about a capture of `count` Gaussians from the cache; None where it keeps none, or none sound."""
     if not os.path.isfile(path):  # False also where the folder is closed to us
         return None
     try:
@@ -234,9 +234,9 @@ class Captures:
     scene: SplatScene
     """A sample of all of them, about the origin of the first one."""
     rows: tuple[slice, ...]
-    """Where the Gaussians of each capture are among those of the scene."""
+    """Rows of each capture among the Gaussians of the scene."""
     moved: tuple[Annotated[Tensor, "3"], ...]
-    """What was added to the means of each capture, so that none lies in another's place."""
+    """Offset of the means of each capture, so that none lies in another's place."""
     first: Capture
     """The first capture, as it was read."""
     count: int
@@ -327,7 +327,7 @@ def open_captures(
 
 
 class _Sample(NamedTuple):
-    """What is kept of one of several captures."""
+    """Sample of one of several captures."""
 
     part: Gaussians
     """Some of those that can be drawn, about the origin of the first capture."""
@@ -341,7 +341,7 @@ class _Sample(NamedTuple):
 
 
 def moved_origin(origin: Origin, new: Origin) -> Annotated[Tensor, "3"]:
-    """What is added to positions about one origin to have them about a new one."""
+    """Offset from positions about one origin to those about a new one."""
     parts = []
     for old, other in zip(origin, new, strict=True):
         parts.append(old - other)
@@ -358,7 +358,7 @@ def _sample_of(capture: Capture, origin: Origin, most: int) -> _Sample:
 
 
 def _joint_key(samples: Sequence[_Sample], most: int) -> bytes:
-    """What the findings about several captures depend on, in the place of a file's content."""
+    """Key of the findings about several captures, in the place of a file's content."""
     key = hashlib.sha256(f"{most} {len(samples)}".encode())
     for each in samples:
         key.update(each.digest)
@@ -376,7 +376,7 @@ def _read(path: Path, look: LookConfig, say: Callable[[str], None]) -> Capture:
 
 
 def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
-    """What takes captures apart, in a row along x, where some lie in one place; nothing where they are
+    """Offsets that take captures apart, in a row along x, where some lie in one place; nothing where they are
     neighbours.
     """
     boxes = []
@@ -398,7 +398,7 @@ def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
 
 
 def _overlap(boxes: Sequence[tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]]) -> bool:
-    """Whether any two boxes, lowest and highest corner, lie in one place."""
+    """True where any two boxes, lowest and highest corner, lie in one place."""
     for (low, high), (other_low, other_high) in itertools.combinations(boxes, 2):
         shared = (torch.minimum(high, other_high) - torch.maximum(low, other_low)).clamp_min(0)
         smaller = torch.minimum(high - low, other_high - other_low)

@@ -61,7 +61,7 @@ _MAX_OVERVIEW_PIXELS = 16_000_000
 towns (district.json).
 """
 _MAX_OVERVIEW_REDUCTION = 4
-"""How far photographs are reduced before some are left out; by eye."""
+"""Reduction of photographs before some are left out; by eye."""
 _CELL_RATE = 0.5
 """Factor of the learning rates in cells, whose windows are seen more often than the photographs of the whole
 scene; by eye.
@@ -82,7 +82,7 @@ _RUN_LENGTH = 256
 _MAX_DRAWN_WINDOWS = 40
 """Windows that are drawn to see what they show, at most, evenly over all; by eye."""
 _WINDOW_REDUCTION = 4
-"""How far the windows are reduced for that; by eye."""
+"""Reduction of the windows for that; by eye."""
 _MIN_SHOWN_WEIGHT = 0.003
 """Sum of the weights of a Gaussian in all pixels of a window from which on it is shown; by eye: below a 256th
 of a pixel.
@@ -318,7 +318,7 @@ def open_cell(task: Task) -> Overview | CellPart:
 
 
 def overview_config(config: GaussiansConfig, scene: ParsedScene) -> tuple[GaussiansConfig, int]:
-    """How the whole scene is trained before its cells, and which one of so many photographs it learns from.
+    """Training of the whole scene before its cells, and which one of so many photographs it learns from.
 
     Of smaller images, then of fewer, where memory would not be bounded.
     """

@@ -131,7 +131,7 @@ class Gaussians:
         return bounded, (self.quaternions.abs() >= _MIN_QUATERNION).any(1)
 
     def faults(self) -> list[str]:
-        """How many Gaussians cannot be drawn, for each reason: "3 that are not finite"."""
+        """Counts of Gaussians that cannot be drawn, for each reason: "3 that are not finite"."""
         bounded, turned = self._sound()
         counts = {"that are not finite": ~bounded, "without a rotation": bounded & ~turned}
         found: list[str] = []
@@ -217,7 +217,7 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> Gaussians:
 
 
 class Bulk(NamedTuple):
-    """Where most of N points lie, and how far out the others."""
+    """Place of most of N points, and distances of the others."""
 
     side: float
     """Longest side of the box of the middle 80 % along each axis; of all points where that has none."""

@@ -1,4 +1,4 @@
-"""What points up in a capture whose file does not say it: found by the ground, a slab of level surfaces with
+"""Direction up in a capture whose file does not say it: found by the ground, a slab of level surfaces with
 everything else on one side of it.
 
 Only shapes decide, never colours: a restyled file is understood as the one that it was made of.
@@ -129,7 +129,7 @@ class _Slab(NamedTuple):
 
 
 def _areas(gaussians: Gaussians) -> tuple[Annotated[NDArray[np.float64], "N"], NDArray[np.float64]]:
-    """What is seen of each Gaussian: its largest section times its opacity, and the part [N 3] of that which
+    """Visible part of each Gaussian: its largest section times its opacity, and the part [N 3] of that which
     lies across each axis.
     """
     sizes = gaussians.log_scales.double().exp()

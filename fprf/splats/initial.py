@@ -1,4 +1,4 @@
-"""Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else
+"""First Gaussians: at the reconstruction's points, else at points matched between posed views, else
 anywhere in view.
 """
 

@@ -76,9 +76,9 @@ _LEARNING_RATES = {
 times as much come to 0.07 dB less and 0.04 dB more on garden_seattle (training_trials.json).
 """
 _FINAL_RATE_SHARE = 0.2
-"""What is left of these, and of the decay, at the end of the training; by eye."""
+"""Share that is left of these, and of the decay, at the end of the training; by eye."""
 _FINAL_MEANS_RATE_SHARE = 0.05
-"""What is left of the means' rate; by eye."""
+"""Share that is left of the means' rate; by eye."""
 _HARMONICS_DECAY = 3e-3
 """Weight decay of the harmonics above degree 0, a step. From where no photograph looks they would become any
 colour, which a style that refits cut colours brings into view as specks; by eye.
@@ -136,7 +136,7 @@ LimitWidths = Callable[[Trainable, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """How many Gaussians there may be, where, and how wide."""
+    """Bounds on the count, places and widths of Gaussians."""
 
     room: int
     """Gaussians that there is memory for."""
@@ -166,12 +166,12 @@ class Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSource:
-    """What a run was made of."""
+    """Source of a run."""
 
     known: Known
-    """What scene.json will hold."""
+    """Content of scene.json."""
     points: str
-    """Where the first Gaussians come from."""
+    """Source of the first Gaussians."""
 
 
 class GaussianLearner(SceneLearner):
@@ -217,7 +217,7 @@ class GaussianLearner(SceneLearner):
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device of the Gaussians."""
         if isinstance(self.model, GsplatGaussians):
             return self.model.device
         return CPU

@@ -35,7 +35,7 @@ _MERGED_GAUSSIANS = 4
 _LEVEL_COUNT = 4
 """Levels, the finest included; by eye."""
 _REACH_DEVIATIONS = 3.0
-"""How far a Gaussian reaches, in standard deviations: 98.9 % of its weight."""
+"""Reach of a Gaussian, in standard deviations: 98.9 % of its weight."""
 _MAX_REACH_DEVIATIONS = 3.5
 """Reach in standard deviations where nothing may be left out: at least sqrt(-2 log MIN_ALPHA) = 3.33
 (`ops.rasterise`).

@@ -57,9 +57,9 @@ class _Straightened(NamedTuple):
     camera: Pinhole
     image: Image
     valid: NDArray[np.bool_] | None
-    """Where it counts; None = everywhere."""
+    """Pixels that count; None = all."""
     sky: NDArray[np.bool_] | None
-    """Where it shows sky; None = not known."""
+    """Pixels of sky; None = not known."""
 
 
 class _TargetCache(OrderedDict[tuple[int, int], Target]):

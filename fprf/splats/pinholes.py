@@ -67,7 +67,7 @@ def undistorted(
 def _places(
     lens: Intrinsics, pinhole: tuple[float, ...], width: int, height: int
 ) -> tuple[Annotated[Floats, "h w"], Annotated[Floats, "h w"], Annotated[NDArray[np.bool_], "h w"]]:
-    """Where a lens shows the pixels of a pinhole with an intrinsic matrix, as `cv2.remap` takes it, and which
+    """Places in a lens of the pixels of a pinhole with an intrinsic matrix, as `cv2.remap` takes it, and which
     of them it shows.
 
     Most views of a capture look through one lens.

@@ -70,7 +70,7 @@ _GAUSSIANS_STEP = 10_000
 _EXPONENTIALS = 1 << 16
 """Numbers whose exponential is taken."""
 _EXPONENTIAL_REPEATS = 200
-"""How often: the fastest counts, as other work only slows it down."""
+"""Repetitions: the fastest counts, as other work only slows it down."""
 _REFERENCE_SECONDS = 55e-6
 """Seconds of the fastest on one of the two cores named above."""
 _REFERENCE_CORES = 2
@@ -87,7 +87,7 @@ _WARM_UP_STEPS = 20
 _TIMED_STEPS = 10
 """Steps of which the fastest counts; by eye."""
 _WHOLE_STEP_RATIO = 1.4
-"""What a step of training takes in units of these, with all that is done between steps; by eye."""
+"""Cost of a training step in units of these, with all that is done between steps; by eye."""
 _MIN_CARD_SECONDS = 1e-4
 """Seconds of a step there, at least: what launching its kernels takes, whatever the size; by eye."""
 

@@ -21,7 +21,7 @@ _GAIN_RATE = 5e-3
 _EXPONENT_RATE = 2e-3
 """Learning rate of the exponent that all views share; by eye."""
 _FINAL_CORRECTION_SHARE = 0.1
-"""What is left of these rates, and of that of poses, at the end of the training; by eye."""
+"""Share that is left of these rates, and of that of poses, at the end of the training; by eye."""
 _FIRST_DECAY = 0.9
 """Decay of Adam's first moment: that of Kingma and Ba 2015."""
 _SECOND_DECAY = 0.999

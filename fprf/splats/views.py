@@ -70,7 +70,7 @@ class _PlaceGrid(NamedTuple):
 
     per_axis: int
     reach: float
-    """How far out the last one along an axis lies, in half spans of the capture."""
+    """Distance of the last one along an axis, in half spans of the capture."""
 
 
 _COARSE_GRID = _PlaceGrid(per_axis=17, reach=3.0)
@@ -81,11 +81,11 @@ _FINE_GRID = _PlaceGrid(per_axis=9, reach=0.375)
 # Views from about that place; lengths in the median distance of what is seen from there.
 
 _SIDE_OFFSETS = (0.08, 0.2)
-"""How far cameras stand to its sides."""
+"""Distances of cameras to its sides."""
 _SIDES = 4
 """Cameras to its sides at each of these."""
 _BACK_OFFSETS = (0.0, 0.25)
-"""How far they stand behind it, against the mean direction of what is seen."""
+"""Distances of cameras behind it, against the mean direction of what is seen."""
 _TARGETS = 12
 """Directions that they look in."""
 _MAX_TARGET_QUANTILE = 0.8
@@ -101,7 +101,7 @@ as bad as none: e^3 = 20 times as wide as usual.
 _MIN_SHOWN_DISTANCE = 0.05
 """Distance that nearer Gaussians are taken to have when those that show most are chosen."""
 _RANK_COST = 0.05
-"""What the second-best view of a direction must be worth more than the best of another, in filled views."""
+"""Worth by which the second-best view of a direction must exceed the best of another, in filled views."""
 
 # Views from free places within a room.
 
@@ -116,7 +116,7 @@ _MAX_PLACES = 12
 _DIRECTIONS_PER_PLACE = 8
 """Directions looked in at each."""
 _ROOM_DROP = 0.1
-"""How far these point down, as a slope."""
+"""Slope by which these point down."""
 _ROOM_FOV_DEGREES = 70.0
 """Vertical angle of these views: wide, as in rooms one stands close to things."""
 _MIN_ENCLOSED_SHARE = 0.8
@@ -158,7 +158,7 @@ _MAX_JUDGED_GAUSSIANS = 30_000
 _MIN_FILLED_OPACITY = 0.5
 """Opacity from which on a pixel is taken to show what lies at its depth."""
 _CLOSE_COST = 3.0
-"""What a pixel with something close before the camera costs, in filled ones."""
+"""Cost of a pixel with something close before the camera, in filled ones."""
 
 
 @torch.inference_mode()

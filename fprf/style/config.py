@@ -185,7 +185,7 @@ class StyleConfig(SunConfig):
     alone.
     """
     bold: float = 0.5
-    """How far things are painted that the references do not surely show, in [0, 1]: 0 = everything takes
+    """Strength of the paint on things that the references do not surely show, in [0, 1]: 0 = everything takes
     light alone, 0.5 = as far as the match is sure, 1 = everything is painted. Counts where `stylizer.light`
     is true.
     """

@@ -152,7 +152,7 @@ def _reduced(cutout: Cutout, size: tuple[int, int]) -> tuple[Image, Annotated[Te
 
 
 def _mostly_covered(cover: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]:
-    """What is at least half covered, else whatever is covered at all."""
+    """Cells that are at least half covered, else all that are covered at all."""
     half = cover >= 0.5
     return half if bool(half.any()) else cover > 0
 
@@ -238,7 +238,7 @@ def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]
 def _within_mask(
     selected: Annotated[Tensor, "H W"], opaque: Annotated[Tensor, "H W"] | None, mask: Path, photo: Path
 ) -> Annotated[Tensor, "H W"]:
-    """What a mask selects and is opaque."""
+    """Pixels that a mask selects and that are opaque."""
     both = selected if opaque is None else selected & opaque
     if not bool(both.any()):
         raise DataError(

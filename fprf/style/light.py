@@ -50,7 +50,7 @@ nothing.
 UNRIVALLED = 0.9
 """Lowe's ratio from which on a claim has no rival: below lies the noise between regions of one kind."""
 _MAX_RIVAL_SHARE = 0.8
-"""What a rival takes from confidence at most."""
+"""Share that a rival takes from confidence at most."""
 _NEAREST_SHARE = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
 APPLIED = 0.6
@@ -240,7 +240,7 @@ class Light(nn.Module):
         paint: Annotated[Tensor, "N 1"],
         belongs: Annotated[Tensor, "N K"] | None = None,
     ) -> Annotated[Tensor, "N 3"]:
-        """What `change` adds to the scene's own colours."""
+        """Addition of `change` to the scene's own colours."""
         belongs = self._belongs(semantic, belongs)
         lit = mixed_maps(colour.to(self.maps), belongs, self.maps[:, :3], self.maps[:, 3])
         middle = belongs @ self.between

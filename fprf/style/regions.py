@@ -258,7 +258,7 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
 
 
 class _Asked(NamedTuple):
-    """What a style asks for, in numbers of regions and references."""
+    """Rules of a style, by numbers of regions and references."""
 
     pins: list[tuple[RegionMatch, int]]
     bans: list[tuple[RegionMatch, int]]

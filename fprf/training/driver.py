@@ -62,7 +62,7 @@ _MAX_DIFFERENCES = 4
 
 
 class Schedule(NamedTuple):
-    """How long to train, and how often to save."""
+    """Length of a training, and intervals of saving."""
 
     steps: int | None
     """Number of steps; None = until the minutes are over."""

@@ -1,4 +1,4 @@
-"""What was found out about a scene before it was trained: the part of scene.json that a model is rebuilt from."""
+"""Facts about a scene from before its training: the part of scene.json that a model is rebuilt from."""
 
 import dataclasses
 from dataclasses import dataclass, replace

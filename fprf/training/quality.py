@@ -34,7 +34,7 @@ PRESETS: dict[Name, Preset] = {
     "standard": Preset(merged=2.0),
     "best": Preset(),
 }
-"""What each name stands for; the module says what measured it."""
+"""Settings of each name; the module says what measured them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,7 +114,7 @@ def measure_style(
 def _contacts(
     config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"], scene: SceneStyle
 ) -> Annotated[Tensor, "K K"]:
-    """How much regions touch without an edge of colour between them, from pairs of rendered pixels."""
+    """Contact of regions without an edge of colour between them, from pairs of rendered pixels."""
     # Two pixels a pair, rendered one after the other: colour to look for an edge, semantics to know the
     # regions.
     view, pixel = neighbours(cameras, views, max(1, config.statistics.rays // _RAYS_A_PAIR))

@@ -38,7 +38,7 @@ _TEST_EVERY = 8
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureContents:
-    """What a parser has read of a scene folder."""
+    """Content of a scene folder, as a parser has read it."""
 
     views: Sequence[View]
     """At least one, in the scene's order."""
@@ -280,7 +280,7 @@ def check_sizes(views: Sequence[View], sizes: Sequence[tuple[int, int]], *, redu
 
 
 def _of_one_scale(stated: NDArray[np.float64], found: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which images are scaled by the factor that fits most of them; a factor of 1 must fit to the pixel."""
+    """Images that are scaled by the factor that fits most of them; a factor of 1 must fit to the pixel."""
     # Factors that give each image its size within a pixel.
     low = ((found - 1) / stated).max(1)
     high = ((found + 1) / stated).min(1)

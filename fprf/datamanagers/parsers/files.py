@@ -194,7 +194,7 @@ class NamedFiles:
         return current
 
     def factor(self, path: Path) -> int:
-        """How many times smaller the copy is that is read instead of an image; 1 for an image itself."""
+        """Reduction of the copy that is read instead of an image; 1 for an image itself."""
         return next((self._factors[folder] for folder in path.parents if folder in self._factors), 1)
 
 

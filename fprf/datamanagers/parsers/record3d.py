@@ -84,7 +84,7 @@ class Record3DParser(DataParser):
 
 
 class _Recording(NamedTuple):
-    """What the metadata say."""
+    """Metadata of a capture."""
 
     record: Record
     poses: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What a capture says of each view, checked: poses, sizes, lenses, and that images are there.
+"""Views of a capture, checked: poses, sizes, lenses, and that images are there.
 
 `assembly` makes a scene of views.
 """
@@ -51,7 +51,7 @@ class View:
     """File that the capture names; else one beside the image."""
     sky_mask: Path | None = None
     exposure: float | None = None
-    """Where the capture says it: light is in proportion to it. Above 0."""
+    """Exposure, where the capture says it: light is in proportion to it. Above 0."""
 
 
 class UnusableView(DataError):

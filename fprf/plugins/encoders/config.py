@@ -101,7 +101,7 @@ class Vgg19Config(EncoderConfig):
 
 
 def hub_folder() -> Path:
-    """Where the library of the Hugging Face hub keeps models."""
+    """Folder in which the library of the Hugging Face hub keeps models."""
     home = os.environ.get("HF_HOME") or user_folder("").parent / "huggingface"
     return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
 

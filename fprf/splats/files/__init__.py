@@ -33,17 +33,17 @@ _MAX_STEP_OF_FLOATS = 0.05
 
 
 class Written(NamedTuple):
-    """What a file that was written does not hold."""
+    """Losses of a file that was written."""
 
     faulty: bool = False
     """The Gaussians that cannot be drawn (`Gaussians.faults`) are left out."""
     far: int = 0
     """Outliers that are left out: so far from the others that the format's numbers do not reach both."""
     notes: tuple[str, ...] = ()
-    """What is limited, each as a phrase."""
+    """Limits, each as a phrase."""
 
     def losses(self) -> list[str]:
-        """What was left out but Gaussians that cannot be drawn, and what is limited, each as a phrase."""
+        """Losses but for Gaussians that cannot be drawn, and limits, each as a phrase."""
         if self.far:
             return [f"{self.far} far from the others left out", *self.notes]
         return list(self.notes)
@@ -188,7 +188,7 @@ def write_gaussians(
 
 
 class _Held(NamedTuple):
-    """What a format holds of Gaussians."""
+    """Properties of Gaussians that a format holds."""
 
     gaussians: Gaussians
     faulty: bool
@@ -246,7 +246,7 @@ def write_capture(
 
 
 def _changed(before: Annotated[Tensor, "N K 3"], after: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N"]:
-    """Which Gaussians have other harmonics that are finite; some rows at a time, to save memory."""
+    """Gaussians with other harmonics that are finite; some rows at a time, to save memory."""
     found = []
     for rows in pieces(len(before)):
         other = (after[rows] != before[rows]).flatten(1).any(1)

@@ -74,17 +74,17 @@ class Capture:
     up: tuple[float, float, float] | None = None
     """Direction that points up, where the file says so, or its format."""
     up_reason: str = ""
-    """What says so, as a phrase."""
+    """Source of that, as a phrase."""
     camera: Cameras | None = None
     """The view that the capture was made from, where the file holds it."""
     shift: Origin = (0.0, 0.0, 0.0)
-    """What was taken off the file's coordinates, which lie far from 0."""
+    """Offset taken off the file's coordinates, which lie far from 0."""
     offset: Origin = (0.0, 0.0, 0.0)
-    """What a file beside it adds to them (see `rendering.local_frame`)."""
+    """Offset that a file beside it adds to them (see `rendering.local_frame`)."""
     notes: tuple[str, ...] = ()
-    """How the file was understood where it could mean two things, each as a sentence."""
+    """Choices where the file could mean two things, each as a sentence."""
     activation: Activation = Activation()
-    """Which numbers look activated already, and were not read so."""
+    """Numbers that look activated already, and were not read so."""
 
     @property
     def origin(self) -> Origin:
@@ -142,11 +142,11 @@ class CaptureFormat(PluginConfig):
         return None
 
     def notes(self, gaussians: Gaussians) -> list[str]:
-        """What else a file cannot hold of them, each as a phrase."""
+        """Further limits of a file of them, each as a phrase."""
         return []
 
     def holds(self, capture: Capture, read_as: "CaptureFormat") -> bool:
-        """Whether a capture's own file, recoloured, is a file of this format."""
+        """True where a capture's own file, recoloured, is a file of this format."""
         return self.writes and self.reads and type(read_as) is type(self)
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
@@ -284,7 +284,7 @@ def unpack_bits(word: NDArray[np.uint32], bits: Sequence[int]) -> Floats:
 
 
 def shares(values: Floats, low: Floats, high: Floats) -> Floats:
-    """Where values lie between bounds: 0 to 1, and 0 where the bounds are one."""
+    """Place of values between bounds: 0 to 1, and 0 where the bounds are one."""
     span = np.asarray(high - low, np.float64)  # as exact as the bounds are stored
     return np.where(span > 0, (values - low) / np.where(span > 0, span, 1.0), 0.0)
 
@@ -392,7 +392,7 @@ def spatial_order(means: Floats) -> NDArray[np.int64]:
 
 
 def precise(means: Floats, step: Callable[[Floats, Floats], float], share: float) -> Bools:
-    """Which of means [N 3] a file keeps: all, or all but outliers for which the others would lose precision.
+    """Means [N 3] that a file keeps: all, or all but outliers for which the others would lose precision.
 
     `step` is the distance between positions that the file tells apart, of the means kept and of their bulk.
     It shall be at most `share` of the extent of the bulk; where the bulk itself does not allow that, what it

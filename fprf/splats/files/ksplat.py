@@ -81,7 +81,7 @@ class Ksplat(CaptureFormat):
 
 
 class _Places(NamedTuple):
-    """What steps of 16 bits are positions of."""
+    """Sections that steps of 16 bits are positions in."""
 
     corners: Floats
     """Of each Gaussian's bucket [N 3]."""
@@ -110,7 +110,7 @@ class _Section(NamedTuple):
     degree: int
 
     def body(self, start: int) -> int:
-        """Where the Gaussians begin: behind the sizes of buckets that are not full, and all centres."""
+        """Offset of the Gaussians: behind the sizes of buckets that are not full, and all centres."""
         return start + 4 * self.others + self.centre_bytes * self.buckets
 
     def table(self, path: Path, data: Data, number: int, compression: int, start: int) -> NDArray[Any]:

@@ -37,9 +37,9 @@ _NERFSTUDIO = re.compile(r"\bner(f)?studio\b", re.IGNORECASE)
 _BRUSH = re.compile(r"\bbrush\b", re.IGNORECASE)
 """It writes `Exported from Brush`."""
 _BRUSH_UP: dict[str, Direction] = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
-"""What points up where Brush names a vertical axis by its letter."""
+"""Direction up where Brush names a vertical axis by its letter."""
 _USUAL_UP_OF_LETTER: dict[str, Direction] = _BRUSH_UP | {"z": (0.0, 0.0, 1.0)}
-"""What points up where another program does, and the ground does not tell: programs whose z is vertical
+"""Direction up where another program does, and the ground does not tell: programs whose z is vertical
 (Nerfstudio, Blender) have it point up, those whose y is vertical (COLMAP and what follows it) down.
 """
 _MAX_CAMERA_DISTANCE = 1e15
@@ -129,10 +129,10 @@ def ply_rows(gaussians: Gaussians, origin: Origin) -> NDArray[np.void]:
 
 
 class _Comments(NamedTuple):
-    """What the comments of a header say of a capture."""
+    """Comments of a header about a capture."""
 
     mode: str
-    """How opacities are meant; of several lines the last one counts."""
+    """Meaning of opacities; of several lines the last one counts."""
     vertical: str
     """The vertical axis; empty where no line says it."""
     nerfstudio: bool
@@ -198,7 +198,7 @@ def _along(letter: str, sign: float) -> Direction:
 
 
 class _Columns(NamedTuple):
-    """Which properties of a vertex are what of a Gaussian."""
+    """Properties of a vertex that make up a Gaussian."""
 
     places: dict[str, tuple[int, int]]
     """The harmonic and the channel that each property of a colour is."""

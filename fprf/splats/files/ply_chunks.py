@@ -60,7 +60,7 @@ _COLOUR_BOUNDS = _Bounds(("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b"
 
 
 def is_chunked(header: Header) -> bool:
-    """Whether a PLY is of this layout."""
+    """True for a PLY of this layout."""
     return header.has_property(_WORDS[0])
 
 

@@ -98,7 +98,7 @@ class Header(NamedTuple):
         return found
 
     def has_property(self, name: str) -> bool:
-        """Whether any element has a property of that name."""
+        """True where any element has a property of that name."""
         return any(words[0] == "property" and words[-1] == name for words in self.lines)
 
 
@@ -308,7 +308,7 @@ def _kinds(words: list[str]) -> list[str]:
 
 
 def _after_lists(data: Data, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
-    """Where rows with lists end; None where that is beyond the end of the file."""
+    """End of rows with lists; None where that is beyond the end of the file."""
     for _ in range(count):
         for first, *values in fields:
             kind = np.dtype(first)

@@ -65,7 +65,7 @@ _MAX_GZIP_RATIO = 1032
 _MAX_ZSTD_RATIO = 64
 """The same of positions of version 4, which hardly shrink in captures, and some bytes for small files."""
 _ZSTD_SLACK_BYTES = 1 << 16
-"""What a small stream may unpack to beyond that."""
+"""Bytes that a small stream may unpack to beyond that."""
 _MAX_TRAILER_BYTES = 1 << 20
 """Bytes behind the streams (extensions) that are kept."""
 _PIECE_BYTES = 1 << 12
@@ -73,7 +73,7 @@ _PIECE_BYTES = 1 << 12
 _TINT_SCALE = 0.15
 """Of mean colours: bytes reach harmonics of -3.3 to 3.3."""
 _TURN_ORDER = (1, 2, 3, 0)
-"""Where the components x y z w of a file lie in w x y z."""
+"""Positions of a file's components x y z w in w x y z."""
 _SAMPLED_GAUSSIANS = 20_000
 """As many as tell the ground (`ground.find_ground`)."""
 
@@ -112,11 +112,11 @@ class _Container(NamedTuple):
     streams: list[bytes]
     """Unpacked; the last one is empty where there are no harmonics but the constants."""
     extensions: bytes
-    """What lies behind the streams, or before the table of version 4."""
+    """Bytes behind the streams, or before the table of version 4."""
     unpacked: Data
     """The file without gzip."""
     trailer: bytes | None
-    """What lies behind the gzip members; None where the file is not of gzip."""
+    """Bytes behind the gzip members; None where the file is not of gzip."""
     frames: list[bytes]
     """Packed streams of version 4."""
 

@@ -16,7 +16,7 @@ __all__ = ["ContrastConfig"]
 
 @dataclass(frozen=True, kw_only=True)
 class ContrastConfig(EncoderConfig):
-    """How far each pixel is from its surroundings: no weights, nothing to download."""
+    """Difference of each pixel from its surroundings: no weights, nothing to download."""
 
     window: int = 9
     """Side of the surroundings, in pixels."""
