@@ -99,3 +99,57 @@ def test_a_file(page: Any, tmp_path: Path) -> None:
     page.goto(written(tmp_path / "page.html", seen(ball(500))).as_uri())
     page.wait_for_selector(".place.ready", timeout=120_000)
     assert violations(page) == []
+
+
+STOPS = """() => {
+  const all = [...document.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex]")];
+  window.stops = all.filter((each) => !each.disabled && each.tabIndex >= 0 && each.type !== "file"
+    && each.checkVisibility({ visibilityProperty: true, opacityProperty: false }) && each.getClientRects().length);
+  window.stops[0].focus();
+  return window.stops.map((each) => each.id || each.className || each.textContent.trim() || each.tagName);
+}"""
+REACHED = """() => {
+  const each = document.activeElement, box = each.getBoundingClientRect();
+  const seen = [[0.5, 0.5], [0.25, 0.25], [0.75, 0.75]].some(([x, y]) => {
+    const top = document.elementFromPoint(box.x + x * box.width, box.y + y * box.height);
+    return top && (each.contains(top) || top.contains(each) || top.closest("label"));
+  });
+  return { stop: window.stops.indexOf(each), seen };
+}"""
+
+
+def focus_order(page: Any) -> None:
+    """Tab goes once through all that can be focused, in the order of the document, and each is seen then."""
+    assert page.locator("[tabindex]:not([tabindex='0']):not([tabindex='-1'])").count() == 0
+    names = page.evaluate(STOPS)
+    assert len(names) > 4
+    reached = [page.evaluate(REACHED)]
+    while len(reached) < len(names):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate(REACHED))
+    assert [names[each["stop"]] if each["stop"] >= 0 else "?" for each in reached] == names
+    assert [name for name, each in zip(names, reached, strict=True) if not each["seen"]] == []
+
+
+def test_the_focus_goes_through_a_file_in_order(page: Any, tmp_path: Path) -> None:
+    page.goto(written(tmp_path / "page.html", seen(ball(300))).as_uri())
+    page.wait_for_selector(".place.ready", timeout=120_000)
+    focus_order(page)
+
+
+def test_the_focus_goes_through_the_start_page_in_order(page: Any, tmp_path: Path) -> None:
+    with ExitStack() as stack, ViewerServer(Access("127.0.0.1", None), 0) as server:
+        start = Start(tmp_path / "made", server, lambda path, name: pytest.fail("nothing is opened"))
+        stack.callback(start.close)
+        server.show_start(start)
+        page.goto(server.address)
+        page.locator("#choose").wait_for()
+        focus_order(page)
+
+
+def test_the_focus_goes_through_a_scene_in_order(page: Any) -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        server.open(lambda: Viewed(seen(ball(300)), "ball", 1), warm=False)
+        page.goto(server.address)
+        page.wait_for_selector(".place.drawn", timeout=120_000)
+        focus_order(page)
