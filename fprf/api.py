@@ -88,6 +88,10 @@ class Shot:
         """The colours as a picture of Pillow."""
         return Image.fromarray(self.pixels)
 
+    def __repr__(self) -> str:
+        height, width = self.rgb.shape[:2]
+        return f"<Shot {width}x{height}>"
+
     def _repr_png_(self) -> bytes:
         """The picture in a notebook."""
         return encode(self.pixels, "png")
@@ -296,6 +300,11 @@ class TrainedScene:
                 write_bytes(copy, picture.read_bytes())
             write_style(file, saved._replace(style=replace(saved.style, references=references)))
 
+    def __repr__(self) -> str:
+        """The scene in one line: without the numbers of its tensors."""
+        style = _style_name(self.references) if self.styled is not None else "as captured"
+        return f"<TrainedScene {self.trained.known.name!r}: {len(self.names)} views, {style}>"
+
     def _repr_html_(self) -> str:
         """The scene in a notebook: a page to walk through, of Gaussians; a picture of a field."""
         from .page.writer import notebook_html
@@ -473,6 +482,17 @@ class FinishedCapture:
         shapes.
         """
         return replace(self, harmonics=self.capture.gaussians.recoloured(harmonics).harmonics, references=())
+
+    def __repr__(self) -> str:
+        """The capture in one line: without the numbers of its tensors."""
+        if self.harmonics is None:
+            style = "as read"
+        elif self.references:
+            style = _style_name(self.references)
+        else:
+            style = "recoloured"
+        count = len(self.capture.gaussians)
+        return f"<FinishedCapture {self.capture.path.name!r}: {count} Gaussians, {style}>"
 
     def _repr_html_(self) -> str:
         """The capture in a notebook: a page to walk through, which opens in its style."""

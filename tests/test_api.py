@@ -179,6 +179,18 @@ def test_a_reference_may_be_a_picture_in_memory(scene: TrainedScene, world: Worl
     for wrong in (np.zeros((4, 4), np.uint8), np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3), np.int64)):
         with pytest.raises(DataError, match="references: "):
             scene.stylize(wrong)
+    with pytest.raises(DataError, match=r"references: None; a photograph is"):
+        photograph_files(None)  # type: ignore[arg-type]
+
+
+def test_what_is_printed_of_results_is_one_line(scene: TrainedScene, world: World, tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "scan.ply", ball(20))
+    scan = fprf.read(tmp_path / "scan.ply")
+    grey = scan.recoloured(scan.gaussians.harmonics * 0)
+    styled = scene.stylize(world.references[0])
+    printed = [repr(each) for each in (scene, styled, scene.render(0), scan, grey)]
+    assert all(len(line) < 120 and "tensor" not in line for line in printed)
+    assert len(set(printed)) == len(printed) and world.references[0].stem in printed[1]
 
 
 def test_pictures_are_upright_and_keep_profile_and_transparency(tmp_path: Path) -> None:

@@ -76,8 +76,9 @@ def run(args: list[str]) -> int:
     # Listing reads metadata alone; --check imports everything.
     checked = dict(faults()) if config.check else {}
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    for title in ("group", "name", "object", "package", *(["state"] if config.check else [])):
-        table.add_column(title, no_wrap=title != "object", overflow="fold")
+    # The state stands where it is read first; objects and versions, which are long, wrap on a narrow screen.
+    for title in ("group", "name", *(["state"] if config.check else []), "object", "package"):
+        table.add_column(title, no_wrap=title not in ("object", "package"), overflow="fold")
     last = ""
     for row in rows():
         shown = "" if row.group == last else row.group
@@ -86,8 +87,8 @@ def run(args: list[str]) -> int:
             state = "[red]broken[/]"
         else:
             state = "[green]ok[/]"
-        cells = (shown, f"[cyan]{escape(row.name)}[/]", escape(row.value), escape(row.package))
-        table.add_row(*cells, *([state] if config.check else []))
+        name = f"[cyan]{escape(row.name)}[/]"
+        table.add_row(shown, name, *([state] if config.check else []), escape(row.value), escape(row.package))
     console = Console()
     console.print(table)
     if not config.check:

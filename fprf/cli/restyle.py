@@ -611,8 +611,10 @@ def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Se
     names = labels(config.references)
     styles = []
     for k, (each, pictures) in enumerate(zip(made, after, strict=True)):
-        of = [names[k]] if config.each else each.styled.dictionary.names
-        name = each.name or " + ".join(Path(label).stem for label in of)
+        # Without photographs the dictionary is that of the scene itself, which is no reference of the page.
+        of = [names[k]] if config.each else names
+        shown_name = each.name or " + ".join(Path(label).stem for label in of)
+        name = ", ".join(part for part in (shown_name, config.light_name) if part)
         harmonics = each.scene.shown.harmonics
         lit = each.styled.restyle.lit
         styles.append(Style(name, pictures, harmonics, references=of, lit=lit))

@@ -2,6 +2,7 @@
 
 import atexit
 import hashlib
+import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ def photograph_files(photographs: Photograph | Sequence[Photograph]) -> tuple[Pa
     """The files of one photograph or several; pictures in memory are written as PNG into a temporary folder, which
     goes with the process.
 
-    Raises DataError for an array that is no picture.
+    Raises DataError for an array that is no picture, and for what is no photograph at all.
     """
     if isinstance(photographs, str | Image.Image | np.ndarray | Tensor) or not isinstance(
         photographs, Sequence
@@ -60,8 +61,12 @@ def _file(photograph: Photograph) -> Path:
         photograph = photograph.detach().cpu().numpy()
     if isinstance(photograph, np.ndarray):
         photograph = _pictured(photograph)
-    if not isinstance(photograph, Image.Image):
+    if isinstance(photograph, str | os.PathLike):
         return as_path(photograph)
+    if not isinstance(photograph, Image.Image):
+        raise DataError(
+            f"references: {photograph!r:.60}; a photograph is a file's path, a picture of Pillow, or an array [H W 3]"
+        )
     # Upright, as readers of files have it; the profile of its colours stays with it.
     upright = ImageOps.exif_transpose(photograph)
     if upright.mode not in _PNG_MODES:

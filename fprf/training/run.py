@@ -31,6 +31,7 @@ from ..errors import CheckpointError, UsageError
 from ..io import tensorfiles
 from ..io.atomic import write_json
 from ..io.strict_json import open_json
+from ..plugins.captures import format_name
 from ..plugins.codec import from_json
 from ..plugins.registry import nearest
 from ..rendering.cameras import Cameras
@@ -124,6 +125,16 @@ class Known:
         return Photograph(image, where)
 
 
+def _not_a_run(path: Path) -> str:
+    """What a path without config.json is, and what takes or makes it."""
+    if path.is_file() and format_name(path) is not None:
+        return (
+            f"{path}: a capture of Gaussians, and no run folder; `fprf restyle {path} --references PHOTO.jpg "
+            f"--page {path.stem}.html` restyles it, `fprf view {path}` shows it"
+        )
+    return f"{path}: no config.json here, so it is no run folder; `fprf train` makes one"
+
+
 @dataclass(frozen=True)
 class Run:
     """One folder."""
@@ -147,9 +158,7 @@ class Run:
     def load_config(self) -> tuple[RunConfig, str]:
         """Config and method name. Raises CheckpointError where this is no run folder."""
         if not self.exists:
-            raise CheckpointError(
-                f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one"
-            )
+            raise CheckpointError(_not_a_run(self.root))
         return load_config(self.root / "config.json")
 
     def save_known(self, scene: ParsedScene, data: Path | None, facts: Facts) -> None:

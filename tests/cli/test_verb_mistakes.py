@@ -44,6 +44,7 @@ MISTAKES = """
     export run cameras --output out/one.splat | holds splat
     export run glb --reach 1e-6 --output out | no view sees a surface
     gallery run | --references
+    gallery in.ply --references A.png | `fprf restyle in.ply
     gallery untested --references A.png --split test | --split test
     gallery run --references empty | no image
     gallery run --references A.png --output page.pdf | page.pdf

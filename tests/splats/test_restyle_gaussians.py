@@ -361,6 +361,16 @@ def test_the_verb_writes_capture_page_and_style(
     assert cli.main([*words, *same]) == 0, "what is damaged is made again"
 
 
+def test_a_page_needs_no_photographs_where_a_light_is_named(photographs: list[Path], tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "in.ply", ball(200))
+    words = restyled(tmp_path, photographs[:1])
+    for name, flags in (("lit", words[: words.index("--references")]), ("both", words)):
+        page = tmp_path / f"{name}.html"
+        assert cli.main([*flags, "--light", "golden-hour", "--page", str(page)]) == 0
+        written = page.read_text()
+        assert "golden-hour" in written and (photographs[0].stem in written) == (name == "both")
+
+
 def test_any_encoder_finds_the_regions(photographs: list[Path], tmp_path: Path) -> None:
     """Also those of other packages: the slot is that of fields. What each found is kept beside what others
     did.
