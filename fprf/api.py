@@ -207,6 +207,7 @@ class TrainedScene:
         sun_colour: str | None = None,
         sky_colour: str | None = None,
         sun_size: float = 0.53,
+        unlit: bool = False,
         preset: str | None = None,
     ) -> "TrainedScene":
         """The scene in the style of one photograph or several, or of all in a folder: files, pictures of Pillow or
@@ -241,6 +242,7 @@ class TrainedScene:
             sun_colour=sun_colour,
             sky_colour=sky_colour,
             sun_size=sun_size,
+            unlit=unlit,
         )
         if preset is not None:
             style = with_preset(style, preset)
@@ -436,6 +438,7 @@ class FinishedCapture:
         sun_colour: str | None = None,
         sky_colour: str | None = None,
         sun_size: float = 0.53,
+        unlit: bool = False,
         preset: str | None = None,
         match_light: bool = False,
     ) -> "FinishedCapture":
@@ -469,6 +472,7 @@ class FinishedCapture:
             sun_colour=sun_colour,
             sky_colour=sky_colour,
             sun_size=sun_size,
+            unlit=unlit,
         )
         if preset is not None:
             style = with_preset(style, preset)

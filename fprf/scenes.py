@@ -139,6 +139,11 @@ class Scene(ABC):
         raise UsageError("--fit-poses: this kind of scene fits no poses; leave it out")
 
     @property
+    def light_notes(self) -> tuple[str, ...]:
+        """What there is to say about the light of the scene's look, a line each."""
+        return ()
+
+    @property
     def counts(self) -> Mapping[str, int]:
         """Figures about the scene by name, for metrics.json."""
         return {}

@@ -174,6 +174,8 @@ def _looks(scene: "Scene", styles: Sequence[tuple[str, StyleFile]]) -> "list[_Lo
     encoders = scene.encoders() if styles else None
     for name, file in styles:
         looks.append(_Look(name, apply_style(scene, file, encoders).restyle))
+        for note in scene.restyled(looks[-1].restyle).light_notes:
+            print(note)
     return looks
 
 

@@ -355,7 +355,7 @@ def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
     from ..style.restyle import apply_style
 
     styled = apply_style(scene, file)
-    for note in styled.controls.notes:
-        print(note)
     restyled = scene.restyled(styled.restyle)
+    for note in (*styled.controls.notes, *restyled.light_notes):
+        print(note)
     return Take(name, lambda frame: restyled, styled)

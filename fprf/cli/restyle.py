@@ -262,7 +262,7 @@ def _say_notes(config: RestyleConfig, made: Sequence[_Restyled]) -> None:
     """Print what the styles have to say, each line once."""
     notes = dict[str, None]()
     for each in made:
-        notes |= dict.fromkeys(each.styled.controls.notes)
+        notes |= dict.fromkeys((*each.styled.controls.notes, *each.scene.light_notes))
     for note in notes:
         print(note)
     if config.output is not None and not made:

@@ -91,7 +91,7 @@ def run(args: list[str]) -> int:
         "dictionary_seconds": time.perf_counter() - start,
         "codes": len(styled.codes.reference),
     }
-    for note in styled.controls.notes:
+    for note in (*styled.controls.notes, *scene.restyled(styled.restyle).light_notes):
         print(note)
     saved = styled.controls.saved
     files = []

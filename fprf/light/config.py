@@ -54,6 +54,10 @@ class SunConfig:
     """Colour of the sun: #RRGGBB, or kelvin such as 3500K. none = by its elevation."""
     sky_colour: str | None = None
     """Colour of the sky's light: #RRGGBB, or kelvin such as 9000K. none = as the light says."""
+    unlit: bool = False
+    """Take the sun that the capture was taken in, where one is found, out of its colours first; without `light` and
+    `sun` nothing else changes.
+    """
     sun_size: float = 0.53
     """Diameter of the sun in degrees, in [0, 5]: the larger, the softer are shadows far from what casts them."""
 
@@ -71,7 +75,7 @@ class SunConfig:
     @property
     def light_asked(self) -> bool:
         """A light other than the captured one is asked for, at whatever strength."""
-        return self.light is not None or self.sun is not None
+        return self.light is not None or self.sun is not None or self.unlit
 
     @property
     def light_name(self) -> str:
@@ -80,6 +84,8 @@ class SunConfig:
             return self.light
         if self.sun is not None:
             return f"sun-{self.sun[0]:g}-{self.sun[1]:g}"
+        if self.unlit:
+            return "unlit"
         return ""
 
     @property

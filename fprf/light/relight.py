@@ -41,7 +41,7 @@ _METERED_GAUSSIANS = 8192
 """Gaussians that brightness is measured on, about."""
 _METER_STEPS = 20
 """Halvings of the range of exposures, 2^-8 to 2^8: to 2^-16."""
-_LUMA = (0.2126, 0.7152, 0.0722)
+LUMA = (0.2126, 0.7152, 0.0722)
 """Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 
 
@@ -104,8 +104,19 @@ def gains(
     weights: Annotated[Tensor, "N"],
 ) -> Annotated[Tensor, "N 3"]:
     """k of each Gaussian, at a brightness that keeps the mean luma; `weights` say how much of each is seen."""
+    ratio = irradiance(received, light, sun, up) / captured_irradiance(received, up)
+    return exposed_gain(ratio, colours, weights, light.brightness)
+
+
+def exposed_gain(
+    ratio: Annotated[Tensor, "N 3"],
+    colours: Annotated[Tensor, "N 3"],
+    weights: Annotated[Tensor, "N"],
+    share: float,
+) -> Annotated[Tensor, "N 3"]:
+    """k of each Gaussian for E / E0 above; the mean luma becomes `share` of what it was."""
     before = linear(colours.clamp(0, 1))
-    ratio, exposure = exposed(received, light, sun, up, before, weights)
+    exposure = _exposure(before, ratio, weights, share)
     after = encoded(_compressed(before, exposure * ratio))
     gain = (after + LINEAR_OFFSET) / (encoded(before) + LINEAR_OFFSET)
     return gain.clamp_max(MAX_GAIN)
@@ -154,7 +165,7 @@ def _exposure(
     some = slice(None, None, max(1, len(before) // _METERED_GAUSSIANS))
     before = before[some]
     ratio = ratio[some]
-    weight = weights[some, None] * torch.tensor(_LUMA)
+    weight = weights[some, None] * torch.tensor(LUMA)
     wanted = share * float((before * weight).sum())
     if wanted == 0:  # nothing is lit
         return share

@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, NamedTuple, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..light.captured import USUAL_STRENGTH, CapturedSun, LogLight, sky_ratio
 from ..light.config import SunConfig
-from ..light.relight import LINEAR_OFFSET, Received, affine_change, gains, sun_share
+from ..light.relight import LINEAR_OFFSET, Received, affine_change, exposed_gain, gains, sun_share
 from ..light.skies import MIN_SKY_HEIGHT, sky_pixels
 from ..light.sky import Light, light_of
 from ..light.surfaces import Surfaces, find_surfaces
@@ -46,6 +48,18 @@ _MAX_SPREAD_SHARE = 0.2
 """Distance of a Gaussian from its surface that counts for how thick that is, at most, as a share of that width."""
 _MIN_SHOWN_PIXELS = 1e-2
 """Weight of a Gaussian in all views, from which on they say something about it."""
+_SOUGHT_AZIMUTHS = 16
+"""Places around that are tried for the captured sun, at each elevation."""
+_SOUGHT_ELEVATIONS = (30.0, 45.0, 60.0)
+"""Degrees above the horizon. Lower ones explain much of towns under clouds, too: what faces them is brighter."""
+_MIN_SOUGHT_ELEVATION = 25.0
+"""Degrees above the horizon down to which it is sought."""
+_SOUGHT_STEPS = (7.5, 7.5, 3.75)
+"""Degrees about the best of these that are tried then."""
+_MIN_EXPLAINED = 0.05
+"""Share of the variance of light that a captured sun explains, at least: towns under clouds have up to 0.041."""
+_MIN_TRIED_GAUSSIANS = 500
+"""Gaussians that tell a captured sun."""
 _LIFT_SHARE = 0.4
 """Of that distance, by which points are moved out along their normals."""
 _BLUR_SHARE = 0.0008
@@ -88,6 +102,8 @@ class Illumination:
     up: Annotated[Tensor, "3"]
     ahead: Annotated[Tensor, "3"]
     """Level direction of the first view: azimuth 0."""
+    colours: Annotated[Tensor, "N 3"]
+    """As captured, mean over directions, sRGB."""
 
     @property
     def points(self) -> Annotated[Tensor, "N 3"]:
@@ -152,6 +168,72 @@ class Illumination:
                 most = lit
         return best
 
+    @cached_property
+    def captured_sun(self) -> CapturedSun | None:
+        """The sun of the capture; None under clouds and in the shade."""
+        shown = torch.where(self.far, torch.zeros(()), self.surfaces.weights).nonzero()[:, 0]
+        if len(shown) < _MIN_TRIED_GAUSSIANS:
+            return None
+        # By what the views show of them, and so evenly over pictures.
+        weight = self.surfaces.weights[shown].double().cumsum(0)
+        wanted = (torch.arange(_TRIED_GAUSSIANS) + 0.5) / _TRIED_GAUSSIANS * weight[-1]
+        place = torch.searchsorted(weight, wanted).clamp_max(len(shown) - 1)
+        some = shown[torch.from_numpy(np.unique(place.numpy()))]
+        log_light = LogLight(self.colours[some])
+
+        def explained(azimuth: float, elevation: float) -> float:
+            ratio = self._sun_over_sky(some, self.sun_direction(azimuth, elevation))
+            return log_light.explained(ratio, USUAL_STRENGTH)
+
+        best = (0.0, 0.0)
+        most = -math.inf
+        for elevation in _SOUGHT_ELEVATIONS:
+            for azimuth in [k * 360.0 / _SOUGHT_AZIMUTHS for k in range(_SOUGHT_AZIMUTHS)]:
+                share = explained(azimuth, elevation)
+                if share > most:
+                    best = (azimuth, elevation)
+                    most = share
+        for step in _SOUGHT_STEPS:
+            around = []
+            for place in range(8):
+                turn = math.radians(45.0 * place)
+                rise = best[1] + step * math.sin(turn)
+                across = step * math.cos(turn) / max(math.cos(math.radians(best[1])), 0.2)
+                around.append((best[0] + across, min(max(rise, _MIN_SOUGHT_ELEVATION), 89.0)))
+            shares = [explained(*place) for place in around]
+            if max(shares) > most:
+                most = max(shares)
+                best = around[shares.index(most)]
+        if most < _MIN_EXPLAINED:
+            return None
+        ratio = self._sun_over_sky(some, self.sun_direction(*best))
+        return CapturedSun((best[0] + 180) % 360 - 180, best[1], most, log_light.strengths(ratio))
+
+    def _sun_over_sky(
+        self, rows: Annotated[Tensor, "n"] | slice, sun: Annotated[Tensor, "3"]
+    ) -> Annotated[Tensor, "n"]:
+        """Share of a sun's light that meets some Gaussians over that of the sky's."""
+        offset = self.offset[rows]
+        reach = transport(self.blockers, self.points[rows], frame_of(sun, self.up), offset, offset, self.blur)
+        received = Received(*(part[rows] for part in self.received))._replace(reach=reach)
+        return sky_ratio(received, sun_share(received, sun), self.up)
+
+    @cached_property
+    def unlit_gain(self) -> Annotated[Tensor, "N 3"]:
+        """Factors of colours + 0.055 that take the captured sun away; 1 where there is none."""
+        sun = self.captured_sun
+        if sun is None:
+            return torch.ones(len(self.far), 3)
+        ratio = self._sun_over_sky(slice(None), self.sun_direction(sun.azimuth, sun.elevation))
+        change = 1 / (1 + sun.strength * ratio[:, None])
+        change = torch.where(self.far[:, None], torch.ones(()), change)
+        return exposed_gain(change, self.colours, self.metered, 1.0)
+
+    @property
+    def metered(self) -> Annotated[Tensor, "N"]:
+        """Pixels that all but the sky weigh in the views."""
+        return torch.where(self.sky, torch.zeros(()), self.surfaces.weights)
+
     @property
     def received(self) -> Received:
         """What all Gaussians receive, but for the sun."""
@@ -178,11 +260,15 @@ class Illumination:
 
     def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
         """Factors of colours + 0.055 in a light."""
-        light, sun, received = self.under(config)
-        weights = torch.where(self.sky, torch.zeros(()), self.surfaces.weights)
-        gain = gains(received, light, sun, self.up, gaussians.colours, weights)
-        if bool(self.sky.any()):
-            gain[self.sky] = self.sky_gain(gaussians, light)
+        gain = torch.ones(len(gaussians), 3)
+        if config.unlit:
+            gain = self.unlit_gain
+        if config.light is not None or config.sun is not None:
+            light, sun, received = self.under(config)
+            colours = gain * (gaussians.colours + LINEAR_OFFSET) - LINEAR_OFFSET
+            gain = gain * gains(received, light, sun, self.up, colours, self.metered)
+            if bool(self.sky.any()):
+                gain[self.sky] = self.sky_gain(gaussians, light)
         return 1 + config.sun_strength * (gain - 1)
 
     def sky_gain(self, gaussians: Gaussians, light: Light) -> Annotated[Tensor, "S 3"]:
@@ -253,6 +339,7 @@ def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int
         far=kept.far[rows],
         sky=kept.sky[rows],
         heights=kept.heights[rows],
+        colours=kept.colours[rows],
     )
 
 
@@ -287,6 +374,7 @@ def find_illumination(
         heights,
         up,
         ahead,
+        gaussians.colours,
     )
     open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
     return replace(found, openness=torch.where(far, torch.ones(()), open_))
@@ -349,3 +437,14 @@ def mixed_gain(
     for share, config in parts:
         total += share * (1.0 if config is None else illumination.gain(gaussians, config))
     return total
+
+
+def captured_light_note(sun: CapturedSun | None, *, unlit: bool) -> str:
+    """One line that says what light a capture was taken in, and whether its shadows stay."""
+    if sun is None:
+        return "light as captured: clouds or shade" + (", so --unlit changes nothing" if unlit else "")
+    where = f"sun from azimuth {sun.azimuth:.0f}, elevation {sun.elevation:.0f}"
+    share = f"explains {100 * sun.explained:.0f} % of how brightness varies"
+    if unlit:
+        return f"light as captured: {where} ({share}); it is taken away as far as it was found"
+    return f"light as captured: {where} ({share}); its shadows stay, but for --unlit true"

@@ -31,7 +31,7 @@ from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
 from .pinholes import camera_of, cover, distorted
-from .relighting import Illumination, find_illumination, mixed_gain, relit_harmonics
+from .relighting import Illumination, captured_light_note, find_illumination, mixed_gain, relit_harmonics
 from .restyle import ColourEncoder, restyled_harmonics
 from .semantics import Semantics
 
@@ -162,6 +162,15 @@ class SplatScene(Scene):
         if self.illumination is None:
             return illuminated(self)
         return self.illumination()
+
+    @property
+    def light_notes(self) -> tuple[str, ...]:
+        """What light the capture was taken in."""
+        look = self.look
+        if look is None or not look.lit:
+            return ()
+        unlit = all(config is None or config.unlit for _, config in look.lights)
+        return (captured_light_note(self.light_found.captured_sun, unlit=unlit),)
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""

@@ -12,6 +12,7 @@ from fprf.api import FinishedCapture
 from fprf.cli import main as cli
 from fprf.errors import UsageError
 from fprf.light.config import SunConfig
+from fprf.light.relight import LINEAR_OFFSET
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
@@ -22,7 +23,7 @@ from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.pinholes import camera_of
 from fprf.splats.relighting import find_illumination, relit_harmonics, world_axes
-from fprf.splats.scene import SplatScene, illuminated
+from fprf.splats.scene import SplatScene, illuminated, with_illumination
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import save_dictionary
 from fprf.style.files import StyleFile, read_style, write_style
@@ -118,11 +119,42 @@ SECOND: dict[str, object] = {
     "sun_colour": "3000K",
     "sky_colour": "#4080ff",
     "sun_size": 5.0,
+    "unlit": True,
 }
+
+
+def in_the_sun(scene: SplatScene, sun: tuple[float, float]) -> SplatScene:
+    """The scene as if it had been captured in the sun."""
+    lit_by = scene.restyled(apply_style(scene, StyleFile(StyleConfig(sun=sun))).restyle)
+    return with_illumination(replace(scene, gaussians=lit_by.shown, look=None, illumination=None))
+
+
+def test_a_captured_sun_is_found_and_taken_away(scene: SplatScene) -> None:
+    sunny = in_the_sun(scene, (60.0, 35.0))
+    assert sunny.illumination is not None and scene.illumination is not None
+    known = sunny.illumination()
+    found = known.captured_sun
+    assert found is not None
+    apart = known.sun_direction(found.azimuth, found.elevation) @ known.sun_direction(60.0, 35.0)
+    assert float(apart) > 0.9
+    assert scene.illumination().captured_sun is None
+    # Without its sun it is nearer to what it was.
+    shown = known.surfaces.weights > 1
+    factor = LINEAR_OFFSET + scene.gaussians.colours[shown]
+    apart_before = ((LINEAR_OFFSET + sunny.gaussians.colours[shown]) / factor).log()
+    unlit = sunny.restyled(apply_style(sunny, StyleFile(StyleConfig(unlit=True))).restyle)
+    apart_after = ((LINEAR_OFFSET + unlit.shown.colours[shown]) / factor).log()
+    assert float(apart_after.std()) < 0.7 * float(apart_before.std())
+    assert "taken away" in unlit.light_notes[0]
+    other = scene.restyled(apply_style(scene, StyleFile(StyleConfig(unlit=True))).restyle)
+    assert torch.equal(other.light_gain, torch.ones_like(other.light_gain))
+    assert "clouds or shade" in other.light_notes[0]
 
 
 @pytest.mark.parametrize("name", SECOND)
 def test_a_second_value_changes_the_light(scene: SplatScene, name: str) -> None:
+    if name == "unlit":
+        scene = in_the_sun(scene, (60.0, 35.0))
     assert SECOND.keys() == vars(SunConfig()).keys()
     other = replace(NOON, **{name: SECOND[name]})  # type: ignore[arg-type]
     assert float((lit(scene, other).light_gain - lit(scene, NOON).light_gain).abs().max()) > 1e-3

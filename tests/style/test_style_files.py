@@ -63,6 +63,7 @@ def full(folder: Path) -> StyleFile:
         sun_colour="3000K",
         sky_colour="#4080ff",
         sun_size=2.0,
+        unlit=True,
     )
     return StyleFile(style, {"sky": (0.5, -1.25), "region3": (1e-9, 7.0)}, "bundled-semantic:123")
 
