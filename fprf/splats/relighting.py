@@ -195,12 +195,12 @@ class Illumination:
                     most = share
         for step in _SOUGHT_STEPS:
             around = []
-            for place in range(8):
-                turn = math.radians(45.0 * place)
+            for eighth in range(8):
+                turn = math.radians(45.0 * eighth)
                 rise = best[1] + step * math.sin(turn)
                 across = step * math.cos(turn) / max(math.cos(math.radians(best[1])), 0.2)
                 around.append((best[0] + across, min(max(rise, _MIN_SOUGHT_ELEVATION), 89.0)))
-            shares = [explained(*place) for place in around]
+            shares = [explained(*each) for each in around]
             if max(shares) > most:
                 most = max(shares)
                 best = around[shares.index(most)]
