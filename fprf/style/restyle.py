@@ -174,7 +174,21 @@ def apply_dictionary(
 
     places = tuple((place.about(scene.origin), look(allowed)) for place, allowed in controls.places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene_style.semantic_mean))
+    if config.light:
+        controls = controls._replace(notes=(*controls.notes, *_recognised(dictionary)))
     return Styled(replace(look(controls.allowed), places=places), dictionary, scene_style, codes, controls)
+
+
+def _recognised(dictionary: StyleDictionary) -> list[str]:
+    """A line for each reference that shows the very place."""
+    lines = []
+    for i, pairs in enumerate(dictionary.placed):
+        if pairs is not None:
+            agreeing = f"{pairs.agreeing} points agree with a view"
+            lines.append(
+                f"{dictionary.names[i]}: shows this very place ({agreeing}); its light is measured there"
+            )
+    return lines
 
 
 def sun_of(style: StyleConfig) -> SunConfig | None:
