@@ -98,8 +98,8 @@ def flat_look(
     placed = None
     everywhere = torch.ones(len(flat.style.share), len(dictionary.names)).bool()
     if config.light:
-        placed = placed_light(flat.style, dictionary, everywhere)
         own = decoded_colours(stylizer, flat.style, decoder, features=0.0)
+        placed = placed_light(flat.style, dictionary, everywhere, own)
         light = light_of(flat.style, dictionary, config, own, bold=bold)
         light = None if light is None else light.to(device)
     if decoder is None:

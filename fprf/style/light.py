@@ -403,10 +403,8 @@ def light_maps(
     own = luma(mean)[:, 0]
     grey = luma(torch.eye(3, dtype=torch.float64))
     axes = torch.tensor(_CAST_AXES, dtype=torch.float64)
-    # Smooth regions are sources of light, as the sky is; rough ones are things.
-    deviation = torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
-    roughness = deviation / (own + BLACK_OFFSET)
-    source = ((_MIN_THING_ROUGHNESS - roughness) / (_MIN_THING_ROUGHNESS - _MAX_SOURCE_ROUGHNESS)).clamp(0, 1)
+    deviation = _luma_deviation(covariance)
+    source = sources(mean, covariance)
     # What is nearly white already, as a marble statue is, cannot become brighter without losing its shape.
     gain = _exposure(own, luma(painted)[:, 0], share, source, sure)
     gain = gain.minimum((_MAX_EXPOSED_LUMA / (own + deviation)).clamp_min(1.0))
@@ -424,6 +422,20 @@ def light_maps(
     lit_mean = torch.einsum("kc,kcd->kd", gain[:, None] * mean, towards)
     maps = torch.cat([contrast[:, None, None] * towards, bias[:, None]], 1)
     return maps, _between(lit_mean, painted, axes)
+
+
+def sources(mean: Annotated[Tensor, "K 3"], covariance: Annotated[Tensor, "K 3 3"]) -> Annotated[Tensor, "K"]:
+    """How far regions of these colours are sources of light, in [0, 1]: smooth ones are, as the sky is; rough
+    ones are things.
+    """
+    roughness = _luma_deviation(covariance) / (luma(mean)[:, 0] + BLACK_OFFSET)
+    source: Tensor = (_MIN_THING_ROUGHNESS - roughness) / (_MIN_THING_ROUGHNESS - _MAX_SOURCE_ROUGHNESS)
+    return source.clamp(0, 1)
+
+
+def _luma_deviation(covariance: Annotated[Tensor, "K 3 3"]) -> Annotated[Tensor, "K"]:
+    grey = luma(torch.eye(3).to(covariance))
+    return torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
 
 
 def _exposure(

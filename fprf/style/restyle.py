@@ -153,10 +153,11 @@ def apply_dictionary(
                 share=config.colours,
                 smoothing=config.smoothing(scene_style, allowed),
             )
-        placed = placed_light(scene_style, dictionary, allowed) if config.light else None
+        placed = None
         light = None
-        if config.light and style.bold < 1:
+        if config.light:
             colours_before = decoded_colours(stylizer, scene_style, scene.decoder, features=0.0)
+            placed = placed_light(scene_style, dictionary, allowed, colours_before)
             light = light_of(
                 scene_style, dictionary, config, colours_before, bold=style.bold, allowed=allowed
             )

@@ -117,7 +117,7 @@ def test_known_gains_are_recovered() -> None:
     true = torch.rand(5, 3, generator=draw, dtype=torch.float64) - 0.5
     own = torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     shown = (own + BLACK_OFFSET) * (what @ true).exp() - BLACK_OFFSET
-    found = fit(own, shown, what, torch.ones(4000, 1))
+    found = fit(own, shown, what, torch.ones(4000, 1), torch.ones(1))
     # The ridge of 0.003 beside a variance of 1/12 takes 3.6 % of the coefficients.
     assert float((found.gains - true).abs().max()) < 0.06 * float(true.abs().max())
     assert float(found.slopes) > 0.98
@@ -131,10 +131,13 @@ def test_a_region_whose_own_colours_say_nothing_takes_the_colours_that_are_shown
     own = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     clouds = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     shown = torch.where(belongs[:, :1] > 0, clouds, 0.5 * own)
-    found = fit(own, shown, what, belongs)
+    found = fit(own, shown, what, belongs, torch.ones(2))
     # The slope of unrelated colours deviates by 1 / sqrt(3 x 2000) = 0.013; two pairs of 2000 are for 1.
     assert abs(float(found.slopes[0])) < 0.06
     assert float(found.slopes[1]) > 0.95
+    # As a thing it keeps half of its contrast whatever the photograph shows.
+    thing = fit(own, shown, what, belongs, torch.zeros(2)).slopes
+    assert torch.allclose(thing, (1 + found.slopes) / 2)
     # Of 2000 colours of deviation 0.17 a mean is known to 0.004; the ridge of 0.002 beside a half takes 0.3 %.
     assert float((what[0] @ found.colours - 0.5).abs().max()) < 0.02
 
@@ -167,9 +170,13 @@ def dictionary_of(*references: Reference) -> StyleDictionary:
     return build_dictionary(references, clusters=2, blend=0.0)
 
 
+def colours_of(scene: SceneStyle) -> tuple[Tensor, Tensor]:
+    return scene.region_mean, scene.region_covariance
+
+
 def placed_of(scene: SceneStyle, *references: Reference) -> PlacedLight:
     every = torch.ones(2, len(references), dtype=torch.bool)
-    placed = placed_light(scene, dictionary_of(*references), every)
+    placed = placed_light(scene, dictionary_of(*references), every, colours_of(scene))
     assert placed is not None
     return placed
 
@@ -198,13 +205,13 @@ def test_several_references_share_by_weight_and_what_is_forbidden_is_not_taken()
     shown = list(d.names).index("r")
     allowed = torch.ones(2, 2, dtype=torch.bool)
     allowed[0, shown] = False
-    placed = placed_light(scene, d, allowed)
+    placed = placed_light(scene, d, allowed, colours_of(scene))
     assert placed is not None and float(placed.trust[0]) == 0 < float(placed.trust[1])
     only = torch.zeros(2, dtype=torch.bool)
     only[1 - shown] = True
-    assert placed_light(scene, choose(d, only)[0], EVERYWHERE) is None
+    assert placed_light(scene, choose(d, only)[0], EVERYWHERE, colours_of(scene)) is None
     # Without pairs nobody looked, and joining keeps what is known.
-    assert placed_light(scene, d._replace(placed=()), allowed) is None
+    assert placed_light(scene, d._replace(placed=()), allowed, colours_of(scene)) is None
     parts = [choose(d, torch.arange(2) == i)[0] for i in range(2)]
     joined = concatenate(parts, d.names, [1.0, 1.0])
     assert [each is None for each in joined.placed] == [each is None for each in d.placed]
@@ -215,7 +222,7 @@ def test_fields_and_gaussians_take_the_same_and_strength_scales_it() -> None:
     d = dictionary_of(lit_reference(0, 1))
     # An affine stylizer without colours behind it acts on both alike.
     stylizer = AdainConfig().build(dictionary=d, scene=scene)
-    look = Restyle(stylizer, placed=placed_light(scene, d, EVERYWHERE))
+    look = Restyle(stylizer, placed=placed_light(scene, d, EVERYWHERE, colours_of(scene)))
 
     def drawn(look: Restyle) -> Tensor:
         harmonics = ((colour - 0.5) / HARMONIC)[:, None]
