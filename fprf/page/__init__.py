@@ -1,9 +1,12 @@
 """The page that shows a scene in 3D: one file (`fprf restyle --page`), or served with a scene behind it
 (`fprf view`).
 
-- What browsers run: `web/` (`splats.js` draws, `place.js` moves, `send.js` has links and headsets, `sun.js`
-  the light, `page.js` the controls: every page has these, `stage.html` and `page.css`; `page.html` is the file that one sends;
-  `live.*`, `panel.*`, `field.js`, `photographs.js`, `start.js` are the served page).
+- What browsers run: `web/`, typed by JSDoc (`tsc -p tsconfig.json`). Every page has `stage.html`, `page.css`,
+  `sun.css`
+  and `_SCRIPTS`: `shaders.js`, `graphics.js`, `packed.js` and `splats.js` draw, `camera.js`, `steering.js` and
+  `place.js` move, `stage.js` has the controls, `send.js` links, `headset.js` headsets, `sun.js` the light.
+  `page.html` and `page.js` are the file that one sends; `live.html`, `live.css`, `panel.html` and the scripts that `server.py`
+  names are the served page.
 - Gaussians as bytes: `pack.py`. The page as one file: `writer.py`.
 - Who may connect, and with what: `server.py`, `messages.py`. Photographs and files that come: `uploads.py`,
   `start.py`.
@@ -21,6 +24,24 @@ GARDEN = Path(str(files("fprf") / "garden"))
 EXAMPLES = {path.name: path for path in sorted((GARDEN / "references").glob("*.jpg"))}
 """Photographs to restyle a scene with that ship with fprf, by name."""
 
+_SCRIPTS = (
+    "shaders.js",
+    "dom.js",
+    "graphics.js",
+    "packed.js",
+    "splats.js",
+    "camera.js",
+    "steering.js",
+    "place.js",
+    "headset.js",
+    "send.js",
+    "sun.js",
+    "stage.js",
+)
+"""What every page runs, in this order."""
+PAGE_SCRIPTS = ("page.js",)
+"""What the file that one sends runs besides."""
+
 
 def read_asset(name: str) -> str:
     """A text that browsers get: a file of `web/`."""
@@ -36,4 +57,4 @@ def css(*more: str) -> str:
 
 def script(*more: str) -> str:
     """The scripts of every page, and `more`, one after the other."""
-    return "\n".join(map(read_asset, ("splats.js", "place.js", "send.js", "sun.js", "page.js", *more)))
+    return "\n".join(map(read_asset, (*_SCRIPTS, *more)))

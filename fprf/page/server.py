@@ -47,7 +47,10 @@ _MAX_BODY_BYTES = 20 << 20
 """Bytes of a body: those of a photograph (`uploads.MAX_BYTES`)."""
 _MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
-_LIVE_SCRIPTS = ("live.js", "panel.js", "field.js", "photographs.js", "live_sun.js", "start.js")
+_LIVE_SCRIPTS = (
+    *("requests.js", "notes.js", "field.js", "film.js", "saving.js", "panel.js", "photographs.js", "dropped.js"),
+    *("live_sun.js", "start.js", "live.js"),
+)
 """Scripts of the served page, beside those of every page."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; font-src data:; connect-src 'self'; "

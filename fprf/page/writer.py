@@ -27,7 +27,7 @@ from ..rendering.paths import upwards
 from ..scenes import Scene
 from ..splats.pinholes import camera_of, covering
 from ..splats.scene import SplatScene
-from . import css, read_asset, script
+from . import PAGE_SCRIPTS, css, read_asset, script
 from .pack import Packed, colour_header, colour_section, header, pack, sections
 from .suns import Suns, packed_day
 
@@ -382,7 +382,7 @@ def _text(page: Page, head: Mapping[str, Any] | None, parts: Mapping[str, bytes]
     for name, packed in parts.items():
         text = base64.b64encode(packed).decode()
         scripts.append(f'<script type="text/plain" id="data-{name}">{text}</script>')
-    code = f"{script()}\nopen(JSON.parse(at('data').textContent));\n"
+    code = f"{script(*PAGE_SCRIPTS)}\nopenPage(JSON.parse(at('data').textContent));\n"
     return Template(read_asset("page.html")).substitute(
         title=escape(page.title),
         description=escape(page.lead or "A place in 3D, in the light and colours of photographs."),

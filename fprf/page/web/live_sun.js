@@ -1,3 +1,4 @@
+// @ts-nocheck until its types are told
 // The light of a scene of a server: it finds what the sun reaches, and this page what colours that makes (sun.js).
 
 const ON_THE_WAY = 4; // degrees from the day's way within which a sun has a time

