@@ -48,8 +48,8 @@ _MAX_BODY_BYTES = 20 << 20
 _MAX_MESSAGE_BYTES = 1 << 16
 """Bytes of a WebSocket message; the page sends a few hundred."""
 _LIVE_SCRIPTS = (
-    *("requests.js", "notes.js", "field.js", "film.js", "saving.js", "panel.js", "photographs.js", "dropped.js"),
-    *("live_sun.js", "start.js", "live.js"),
+    *("requests.js", "notes.js", "field.js", "film.js", "saving.js", "panel.js"),
+    *("photographs.js", "dropped.js", "live_sun.js", "start.js", "live.js"),
 )
 """Scripts of the served page, beside those of every page."""
 _POLICY = (
@@ -509,7 +509,7 @@ def _integer(request: Request, name: str) -> int:
 def _example(name: str) -> str:
     """A photograph that ships with fprf, as a link that saves it where no script takes it."""
     link = f'class="example" data-example="{name}" href="/examples/{name}" download title="by Greg Zaal, CC0"'
-    word = name.partition(".")[0]
+    word = name.partition(".")[0].capitalize()
     return f'<a {link}><img src="/examples/{name}" alt="">{word}</a>'
 
 

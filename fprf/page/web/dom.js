@@ -5,7 +5,7 @@
  * @typedef {{
  *   canvas: HTMLCanvasElement, code: HTMLImageElement, panel: HTMLElement,
  *   line: HTMLButtonElement, back: HTMLButtonElement, next: HTMLButtonElement, reset: HTMLButtonElement,
- *   see: HTMLButtonElement, send: HTMLButtonElement, full: HTMLButtonElement, how: HTMLButtonElement,
+ *   see: HTMLButtonElement, send: HTMLButtonElement, full: HTMLButtonElement, more: HTMLButtonElement, how: HTMLButtonElement,
  *   mix: HTMLInputElement, from: HTMLSelectElement, wiping: HTMLButtonElement,
  *   angle: HTMLInputElement, speed: HTMLInputElement, fading: HTMLInputElement, orbiting: HTMLInputElement,
  *   headset: HTMLButtonElement, link: HTMLInputElement, embed: HTMLInputElement,

@@ -22,7 +22,7 @@ class Film {
   }
 
   make() {
-    const seconds = limited(at("seconds"), "Seconds from key to key");
+    const seconds = limited(at("seconds"), "Seconds between two views");
     if (seconds === null) return;
     this.live.tell("film", { seconds, side: Number(at("film-side").value), fps: Number(at("film-fps").value) });
   }
@@ -42,7 +42,7 @@ class Film {
   key(key, number) {
     const tell = (/** @type {string} */ action) => this.live.tell("key", { action, at: number });
     /** @param {string} text @param {string} title @param {() => void} onclick */
-    const button = (text, title, onclick) => make("button", { type: "button", textContent: text, title, ariaLabel: `key ${number + 1}: ${title}`, onclick });
+    const button = (text, title, onclick) => make("button", { type: "button", textContent: text, title, ariaLabel: `view ${number + 1}: ${title}`, onclick });
     return make("span", { className: "key" },
       button(String(number + 1), "go there", () => this.live.place.go(this.live.keyed(key))),
       button("‹", "earlier", () => tell("earlier")),
@@ -52,7 +52,7 @@ class Film {
   offer() {
     const line = say("", true);
     line.classList.remove("bad");
-    line.append(make("a", { href: "/film", textContent: "download the film", download: "" }));
+    line.append(make("a", { href: "/film", textContent: "Download the film", download: "" }));
   }
 
   /** Fly from keyframe to keyframe. */

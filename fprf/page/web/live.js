@@ -4,6 +4,9 @@
 
 const RECONNECT_MS = 1500; // until a lost connection is tried again; by eye
 const PREVIEW_PIXELS = 320; // longest side of the picture in the list of scenes; by eye
+/** @type {[number, number]} pixels of the small picture of a style */
+const PORTRAIT = [192, 144];
+const MAX_PORTRAYED = 500_000; // Gaussians; more would keep a machine without a graphics card busy for seconds; by eye
 /** Messages that change how the scene looks. */
 const CHANGES = ["set", "preset", "card", "map", "region", "undo", "sun"];
 
@@ -43,6 +46,8 @@ class Live {
     this.queue = Promise.resolve();
     // True from what was changed on this page until its colours have come.
     this.changed = false;
+    /** @type {Set<string>} styles whose small pictures are older than their colours */
+    this.stale = new Set(["Captured"]);
     this.previewed = -1; // step of the training whose small picture was sent
     this.start = new Start();
     this.field = new Field(this);
@@ -244,7 +249,7 @@ class Live {
     document.title = `${scene.name} - fprf`;
     at("title").textContent = scene.name;
     at("place").classList.toggle("field", !scene.gaussians);
-    at("save-ply").hidden = !scene.gaussians;
+    at("save-ply-row").hidden = !scene.gaussians;
     const place = new Place(at("canvas"), head, splats, splats ? null : () => (this.remote ?? this.field).step());
     const stage = new Stage(place, [{ name: "Captured" }]);
     this.opened = { scene, place, stage };
@@ -275,6 +280,7 @@ class Live {
     place.listeners.drawn = (rest) => {
       at("place").classList.add("drawn");
       if (rest) this.preview();
+      if (rest) this.portray(place, stage);
     };
     stage.listeners.unfolded = (id) => {
       if (id === "light" && !at("lighting").hidden) this.sun?.open();
@@ -311,6 +317,17 @@ class Live {
     }, "image/jpeg");
   }
 
+  /** A small picture of one style that has new colours, from here. @param {Place} place @param {Stage} stage */
+  portray({ splats, camera, scene, sky: [background, rim] }, stage) {
+    const [name] = this.stale;
+    if (!splats?.styles.has(name ?? "") || splats.count > MAX_PORTRAYED) return;
+    this.stale.delete(name);
+    const look = { first: name, second: name, blend: 1, wipe: -1 };
+    const lens = camera.fitted(...PORTRAIT, { fills: scene.fills ? 1 : 0 });
+    stage.portray(name, splats.snapshot(camera.view, lens, look, PORTRAIT, { near: scene.near, background, rim }));
+    if (this.stale.size) this.place.touch(false);
+  }
+
   /**
    * Progress of the scene's training.
    * @param {{step: number, share: number, psnr: number, seconds_left: number}} message
@@ -332,6 +349,7 @@ class Live {
       const { head, parts } = await unpacked(await asked(`/colours?name=${encodeURIComponent(name)}&version=${version}`));
       await place.splats.add(name, head, parts.rows);
     }
+    this.stale.add(name);
     place.touch(false);
     const fresh = !stage.styles.some((style) => style.name === name);
     stage.add({ name });

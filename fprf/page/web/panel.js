@@ -3,7 +3,7 @@
 const SLIDER_MS = 40; // between two messages of a slider that moves; by eye
 const MAX_WEIGHT = 2; // of a photograph in the mix (messages.py)
 
-/** A photograph on the shelf, with the slider of its weight. @typedef {{node: HTMLElement, weight: HTMLInputElement}} Card */
+/** A photograph on the shelf, with the slider of its weight and its number. @typedef {{node: HTMLElement, weight: HTMLInputElement, much: HTMLOutputElement}} Card */
 
 /**
  * A button of the panel.
@@ -135,7 +135,7 @@ class Panel {
   fillKept(names) {
     at("kept").replaceChildren(...names.map((name) => make("div", { className: "row" },
       make("span", { textContent: name }),
-      labelled("use", `use ${name}`, () => this.use(name)),
+      labelled("Use", `use ${name}`, () => this.use(name)),
       labelled("×", `forget ${name}`, () => this.live.tell("keep", { name, action: "remove" }), "close"))));
   }
 
@@ -148,6 +148,7 @@ class Panel {
   /** @param {ShelfRow[]} shelf */
   fillShelf(shelf) {
     at("examples").hidden = shelf.length > 0;
+    at("panel").classList.toggle("bare", !shelf.length); // nothing can be set of a style that there is not
     const now = new Set(shelf.map((row) => row.card));
     for (const [number, card] of this.cards) {
       if (now.has(number)) continue;
@@ -155,11 +156,13 @@ class Panel {
       this.cards.delete(number);
     }
     for (const row of shelf) {
-      const { node, weight } = this.cards.get(row.card) ?? this.add(row);
+      const { node, weight, much } = this.cards.get(row.card) ?? this.add(row);
       node.classList.toggle("on", row.weight > 0);
       node.style.setProperty("--chip", row.colour ?? "transparent");
       if (weight !== document.activeElement) weight.value = String(row.weight);
       weight.hidden = shelf.length < 2;
+      much.hidden = shelf.length < 2;
+      much.textContent = row.weight.toFixed(1);
     }
   }
 
@@ -178,17 +181,21 @@ class Panel {
    */
   card({ card, name }) {
     const tell = (/** @type {string} */ action, more = {}) => this.live.tell("card", { card, action, ...more });
-    const weight = make("input", { type: "range", min: "0", max: String(MAX_WEIGHT), step: "0.05", title: "weight in the mix", ariaLabel: `weight of ${name}` });
-    weight.oninput = () => this.steady(`card ${card}`, () => tell("weight", { weight: weight.valueAsNumber }));
+    const weight = make("input", { type: "range", min: "0", max: String(MAX_WEIGHT), step: "0.05", title: "How much of this photograph, in the mix", ariaLabel: `weight of ${name}` });
+    weight.oninput = () => {
+      much.textContent = weight.valueAsNumber.toFixed(1);
+      this.steady(`card ${card}`, () => tell("weight", { weight: weight.valueAsNumber }));
+    };
     const image = make("img", { src: `/card?card=${card}`, alt: name, draggable: false });
     const alone = make("button", { type: "button", className: "photo", title: `${name}: this one alone; with Shift in or out of the mix` }, image);
-    const node = make("div", { className: "card" }, alone, make("span", { textContent: name }), weight,
+    const much = make("output");
+    const node = make("div", { className: "card" }, alone, make("p", {}, make("span", { textContent: name, title: name }), much), weight,
       labelled("×", `remove ${name}`, () => tell("remove"), "close"));
     alone.onclick = (event) => {
       if (event.shiftKey) tell("weight", { weight: node.classList.contains("on") ? 0 : 1 });
       else tell("alone");
     };
-    return { node, weight };
+    return { node, weight, much };
   }
 
   /**
@@ -210,9 +217,9 @@ class Panel {
     const rows = shelf.map(({ name, card }) => {
       const share = shares.get(name);
       const much = make("data", { value: String(share ?? 0), textContent: share === undefined ? "" : `${Math.round(100 * share)} %` });
-      return make("div", { className: "row" }, make("span", { textContent: name, title: name }), much, pill("only this", "pin", card), pill("never", "forbid", card));
+      return make("div", { className: "row" }, make("span", { textContent: name, title: name }), much, pill("Only this", "pin", card), pill("Never", "forbid", card));
     });
-    const rest = make("div", { className: "row" }, pill("keep as it is", "keep", null), pill("as the style decides", "free", null));
+    const rest = make("div", { className: "row" }, pill("Keep as it is", "keep", null), pill("As the style decides", "free", null));
     at("region").replaceChildren(head, ...rows, rest);
   }
 }

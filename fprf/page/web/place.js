@@ -12,6 +12,7 @@ const MAX_SIDE = 4096; // pixels a side of the canvas
 const MAX_PIXEL_RATIO = 2; // pixels of the canvas for one of the page; by eye
 const ASK_MS = 4; // between two looks at whether the graphics card has drawn
 const FLIGHT_SECONDS = 0.7; // to another camera; by eye
+const AMBIENCE = 0.9; // how far a place that photographs fill carries on to where nobody photographed; by eye
 const NEARER_SHARE = 0.25; // of the way to what was double clicked; by eye
 
 /**
@@ -106,6 +107,7 @@ class Place {
     const height = Math.max(1, Math.round(box.height * by));
     const bar = canvas.parentElement?.querySelector(".bar")?.getBoundingClientRect(); // styles lie over the stage
     const strip = bar?.height && box.height ? Math.max(0, box.bottom - bar.top) / box.height : 0;
+    canvas.parentElement?.style.setProperty("--bar", `${bar?.height ?? 0}px`);
     if (strip !== this.below) {
       this.below = strip;
       this.touch();
@@ -230,10 +232,11 @@ class Place {
 
   /** Draw what is to be seen into the canvas, over the page's own background. */
   paint({ share = 1, exact = true } = {}) {
-    const { near, cameras } = this.scene;
+    const { near, cameras, fills } = this.scene;
     const [background, rim] = this.sky;
     const depth = this.fading ? cameras[0].depth : 0;
-    if (this.look) this.splats?.draw(this.camera.view, this.lens, this.look, { near, background, rim, depth, share, exact });
+    const ambience = fills && this.fading ? AMBIENCE : 0;
+    if (this.look) this.splats?.draw(this.camera.view, this.lens, this.look, { near, background, rim, ambience, depth, share, exact });
   }
 
   /** Take the colours behind all things from the page's theme. */

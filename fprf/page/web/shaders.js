@@ -10,6 +10,10 @@
 const TEXELS = 2048; // a row of a texture
 const INSTANCE_QUADS = 1024; // quads of an instance: one quad each costs software, and most cards, more than what it covers
 const UNSEEN_SHARE = 0.5; // of the photographs that shall have seen a thing, up to which nothing is shown; by eye: single dark things stand out at the rim
+const AROUND_SIZE = [24, 16]; // pixels of what lies around a picture: it is as soft
+const AROUND_ASKED = [20, 12]; // places of a picture that each of them is a mean of
+const AROUND_WIDTH = 0.11; // of the picture, over which that mean fades: about half of a wing; by eye
+const AROUND_PRIOR = 0.005; // weight of the page's own colour, of one place: where nothing is near; by eye
 const BORDER_SHARE = 0.12; // of a frame's side, within which it counts less; by eye
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
@@ -139,16 +143,32 @@ void main() {
   }
   o = vec4(smoothstep(${UNSEEN_SHARE}, 1., sum / needed));
 }`;
+// What lies around a picture: colours of what is drawn near, carried on to where nothing is.
+const AROUND = `${COMMON}
+uniform sampler2D picture, cover; uniform bool faded; uniform vec3 background; out vec4 o;
+void main() {
+  vec2 here = gl_FragCoord.xy / vec2(${AROUND_SIZE});
+  vec4 sum = ${AROUND_PRIOR} * vec4(background, 1.);
+  for (int i = 0; i < ${AROUND_ASKED[0]}; i++) for (int j = 0; j < ${AROUND_ASKED[1]}; j++) {
+    vec2 there = (vec2(i, j) + .5) / vec2(${AROUND_ASKED}), apart = (there - here) / ${AROUND_WIDTH};
+    vec4 c = texture(picture, there);
+    if (faded) c *= texture(cover, there).r;
+    sum += exp(-.5 * dot(apart, apart)) * c;
+  }
+  o = vec4(sum.rgb / sum.a, 1.);
+}`;
 const SHOW = `${COMMON}
-uniform sampler2D picture, cover; uniform vec2 scale, whole, corner; uniform vec3 background, rim; uniform bool faded; out vec4 o;
+uniform sampler2D picture, cover, around; uniform vec2 whole, corner; uniform vec3 background, rim; uniform bool faded; uniform float ambience;
+out vec4 o;
 void main() {
   vec2 at = gl_FragCoord.xy - corner;
   at.y = whole.y - at.y;
-  vec4 c = texture(picture, at * scale / vec2(textureSize(picture, 0)));
+  vec4 c = texture(picture, at / whole);
   if (faded) c *= texture(cover, at / whole).r;
   // The background: lighter behind the middle of the picture; eight bits would show its steps without the noise.
   float away = smoothstep(0., 1.1, length((at / whole - vec2(.5, .42)) * vec2(1.1, 1.3)));
   float noise = fract(52.9829189 * fract(dot(gl_FragCoord.xy, vec2(.06711056, .00583715)))) - .5;
   vec3 behind = background == rim ? background : mix(background, rim, away) + noise / 255.;
+  if (ambience > 0.) behind = mix(behind, texture(around, at / whole).rgb, ambience);
   o = vec4(c.rgb + (1. - c.a) * behind, 1.);
 }`;

@@ -15,9 +15,9 @@ const FRAME_NUMBERS = 16; // of a frame of a photograph, in four texels
  * A rectangle of a picture in pixels.
  * @typedef {{x: number, y: number, width: number, height: number}} Box
  *
- * Colours behind all things, that at the rim too; what no photograph saw fades where `depth` is given, the distance of what they look
+ * Colours behind all things, that at the rim too, and how far what is drawn carries on to where nothing is, from 0 to 1; what no photograph saw fades where `depth` is given, the distance of what they look
  * at; the share of the resolution; whether exactly; a framebuffer and a box of it, in the place of the canvas.
- * @typedef {{near?: number, background?: Vector, rim?: Vector, depth?: number, share?: number, exact?: boolean,
+ * @typedef {{near?: number, background?: Vector, rim?: Vector, ambience?: number, depth?: number, share?: number, exact?: boolean,
  *   into?: {buffer: WebGLFramebuffer?, box: Box}?}} DrawOptions
  *
  * @typedef {{head: ColourHead, rows: Uint8Array, maps: Float32Array}} Colours
@@ -239,7 +239,7 @@ class Splats {
    * @param {Look} look
    * @param {DrawOptions} options
    */
-  draw(view, lens, look, { near = MIN_NEAR, background = [0, 0, 0], rim = background, depth = 0, share = 1, exact = true, into = null } = {}) {
+  draw(view, lens, look, { near = MIN_NEAR, background = [0, 0, 0], rim = background, ambience = 0, depth = 0, share = 1, exact = true, into = null } = {}) {
     const { width, height } = into?.box ?? this.canvas;
     const target = this.frame(Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height)), this.kindOf(exact));
     const right = target.width / width;
@@ -249,34 +249,80 @@ class Splats {
     this.splat(target, view, scaled, look, near, null);
     const faded = Boolean(depth && this.deep && this.head.seen?.length);
     const cover = faded ? this.cover(target, view, scaled, depth) : null;
-    this.present(target, cover, background, rim, into);
+    const around = ambience ? this.around(target, cover, background) : null;
+    this.present({ target, cover, around }, [background, rim], ambience, into);
+  }
+
+  /**
+   * A small picture of what is to be seen, as a canvas of its own.
+   * @param {Float32Array} view
+   * @param {Lens} lens
+   * @param {Look} look
+   * @param {[number, number]} size
+   * @param {DrawOptions} options
+   */
+  snapshot(view, lens, look, [width, height], options) {
+    const { gl } = this;
+    const { buffer } = this.frame(width, height, "small");
+    this.draw(view, lens, look, { ...options, into: { buffer, box: { x: 0, y: 0, width, height } } });
+    const bytes = new Uint8ClampedArray(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    const canvas = make("canvas", { width, height });
+    const context = canvas.getContext("2d");
+    for (let row = 0; row < height; row++) { // the lowest comes first
+      context?.putImageData(new ImageData(bytes.slice(4 * width * row, 4 * width * (row + 1)), width), 0, height - 1 - row);
+    }
+    return canvas;
+  }
+
+  /** Colours around a picture. @param {Target} target @param {Target?} cover @param {Vector} background */
+  around(target, cover, background) {
+    const { gl } = this;
+    const found = this.frame(AROUND_SIZE[0], AROUND_SIZE[1], "around");
+    const { places } = this.pass("around", { picture: target.picture, cover: (cover ?? target).picture }, found);
+    gl.uniform1i(places.faded, cover ? 1 : 0);
+    gl.uniform3f(places.background, ...background);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    return found;
   }
 
   /**
    * Bring a picture into the canvas, or into a box of another framebuffer.
-   * @param {Target} target
-   * @param {Target?} cover what photographs saw of it
-   * @param {Vector} background
-   * @param {Vector} rim
+   * @param {{target: Target, cover: Target?, around: Target?}} pictures also what photographs saw of it, and what lies around it
+   * @param {[Vector, Vector]} sky
+   * @param {number} ambience
    * @param {{buffer: WebGLFramebuffer?, box: Box}?} into
    */
-  present(target, cover, background, rim, into) {
+  present({ target, cover, around }, [background, rim], ambience, into) {
     const { gl } = this;
     const { x, y, width, height } = into?.box ?? { x: 0, y: 0, width: this.canvas.width, height: this.canvas.height };
-    const { program, places } = this.programs.show;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, into?.buffer ?? null);
-    gl.viewport(x, y, width, height);
-    gl.disable(gl.BLEND);
-    gl.useProgram(program);
-    bindTextures(gl, this.programs.show, { picture: target.picture, cover: (cover ?? target).picture });
+    const pictures = { picture: target.picture, cover: (cover ?? target).picture, around: (around ?? target).picture };
+    const { places } = this.pass("show", pictures, { buffer: into?.buffer ?? null, x, y, width, height });
     gl.uniform1i(places.faded, cover ? 1 : 0);
-    gl.uniform2f(places.scale, target.width / width, target.height / height);
+    gl.uniform1f(places.ambience, ambience);
     gl.uniform2f(places.whole, width, height);
     gl.uniform2f(places.corner, x, y);
     gl.uniform3f(places.background, ...background);
     gl.uniform3f(places.rim, ...rim);
-    gl.bindVertexArray(this.buffers.quads);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /**
+   * Begin a pass over a whole picture.
+   * @param {"show"|"cover"|"around"} name of its program
+   * @param {Object<string, WebGLTexture>} textures
+   * @param {{buffer: WebGLFramebuffer?, x?: number, y?: number, width: number, height: number}} into
+   */
+  pass(name, textures, { buffer, x = 0, y = 0, width, height }) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.viewport(x, y, width, height);
+    gl.disable(gl.BLEND);
+    gl.useProgram(this.programs[name].program);
+    bindTextures(gl, this.programs[name], textures);
+    gl.bindVertexArray(this.buffers.quads);
+    return this.programs[name];
   }
 
   /**
@@ -296,11 +342,7 @@ class Splats {
     const depths = this.frame(width, height, "depth");
     const found = this.frame(width, height, "cover");
     this.drawQuads(depths, target, ASKED_EVERY, true, null);
-    const { program, places } = this.programs.cover;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, found.buffer);
-    gl.disable(gl.BLEND);
-    gl.useProgram(program);
-    bindTextures(gl, this.programs.cover, { depths: depths.picture, seen: this.textures.seen });
+    const { places } = this.pass("cover", { depths: depths.picture, seen: this.textures.seen }, found);
     gl.uniform1i(places.frames, frames.length);
     gl.uniformMatrix4fv(places.view, false, view);
     gl.uniform4f(places.lens, ...lens);
@@ -310,7 +352,6 @@ class Splats {
     gl.uniform1f(places.nearest, near.nearest);
     gl.uniform1f(places.around, near.around);
     gl.uniform1f(places.needed, Math.min(SEEN_BY, near.count));
-    gl.bindVertexArray(this.buffers.quads);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     return found;
   }

@@ -18,6 +18,9 @@ const BLEND_STEP = 0.1; // by a bracket key
  * @typedef {{from: string, to: string, amount: number, wiping: boolean, line: number}} StageState
  */
 
+/** What a style is called on the page: the one that is being made has no name yet. @param {string} name */
+const called = (name) => (name === "Now" ? "Your style" : capital(name));
+
 /** @param {string} src */
 const picture = (src) => make("img", { src, alt: "", draggable: false });
 
@@ -45,7 +48,10 @@ class Stage {
 
   listen() {
     const { place, root } = this;
-    at("mix").oninput = () => this.set({ amount: at("mix").valueAsNumber / 100 });
+    at("mix").oninput = () => {
+      const share = at("mix").valueAsNumber / 100;
+      this.set(this.wiping ? { line: share } : { amount: share });
+    };
     at("from").onchange = () => this.set({ from: at("from").value });
     at("wiping").onclick = () => this.compare();
     at("back").onclick = () => place.step(-1);
@@ -55,6 +61,10 @@ class Stage {
     at("full").hidden = !root.requestFullscreen;
     at("see").hidden = !this.seeing;
     for (const id of Object.keys(PANELS)) at(id).onclick = () => this.unfold(id);
+    at("more").onclick = () => {
+      const open = below(root, ".tools").classList.toggle("open");
+      at("more").setAttribute("aria-expanded", String(open));
+    };
     this.listenToLine();
     addEventListener("keydown", (event) => this.key(event));
   }
@@ -91,12 +101,19 @@ class Stage {
     if (this.styles.some((each) => each.name === name)) return;
     const card = make("button", { type: "button", className: "look", title: name, onclick: () => this.choose(name) });
     if (thumb) card.append(picture(thumb));
-    card.append(make("span", { className: "name", textContent: name }));
+    card.append(make("span", { className: "name", textContent: called(name) }));
     if (of.length) card.append(make("span", { className: "of" }, ...of.slice(0, MAX_SHOWN).map(picture)));
     this.styles.push({ ...style, card });
     at("looks").insertBefore(card, at("add"));
-    at("from").append(make("option", { value: name, textContent: name }));
+    at("from").append(make("option", { value: name, textContent: called(name) }));
     this.set({});
+  }
+
+  /** Show what the scene looks like in a style. @param {string} name @param {HTMLCanvasElement} drawn */
+  portray(name, drawn) {
+    const card = this.styles.find((each) => each.name === name)?.card;
+    card?.querySelector("canvas")?.remove();
+    card?.prepend(drawn);
   }
 
   /** A line between two styles, or none: never between one and itself. */
@@ -174,11 +191,14 @@ class Stage {
     const { from, to, amount, wiping, line } = this;
     this.place.show({ first: from, second: to, blend: amount, wipe: wiping ? line : -1 });
     this.styles.forEach(({ name, card }) => card.setAttribute("aria-pressed", String(name === to)));
-    at("mix").value = String(100 * amount);
-    at("mix").setAttribute("aria-valuetext", `${Math.round(100 * amount)} % ${to}`);
-    at("mix").disabled = wiping || from === to;
+    const share = Math.round(100 * (wiping ? line : amount));
+    at("mix").value = String(share);
+    at("mix").setAttribute("aria-valuetext", wiping ? `line at ${share} %` : `${share} % ${to}`);
+    at("mix").disabled = from === to;
     at("from").value = from;
-    at("towards").textContent = to;
+    at("towards").textContent = called(to);
+    at("much").textContent = from === to ? "" : `${share} %`;
+    this.root.classList.toggle("alone", this.styles.length < 2);
     at("blending").hidden = this.styles.length < 2 && !this.root.classList.contains("field");
     at("wiping").setAttribute("aria-pressed", String(wiping));
     this.fillLine();
@@ -189,8 +209,8 @@ class Stage {
     handle.hidden = !this.wiping;
     handle.style.left = `${100 * this.line}%`;
     handle.setAttribute("aria-valuenow", String(Math.round(100 * this.line)));
-    handle.dataset.left = this.from;
-    handle.dataset.right = this.to;
+    handle.dataset.left = called(this.from);
+    handle.dataset.right = called(this.to);
   }
 
   /** Open the panel of a button, or close it; one is open at a time. @param {string?} id null closes all */
