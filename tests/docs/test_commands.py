@@ -52,7 +52,7 @@ ELSEWHERE = {
     "--tone": "needs a run whose photographs differ in exposure: tests/training/test_camera_optimizers.py",
 }
 """Commands with these words, and where they are tested instead."""
-TOOLS = ("python3", "python", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs", "uvx", "pipx")
+TOOLS = ("python3", "python", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs", "uvx", "pipx", "npx")
 """Programs that are not fprf: that their options exist in pyproject.toml is checked, they are not run."""
 SMALL = {
     "0015:67,33": "0005:20,12", "0015": "0005", "--keep 7": "--keep 2", "--cells 16": "--cells 2",

@@ -164,7 +164,7 @@ def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
 def test_the_whole_page_works_by_keyboard(page: Any) -> None:
     page.keyboard.press("1")
     reached = []
-    for _ in range(16):
+    for _ in range(20):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("() => document.activeElement.id || document.activeElement.className"))
     assert {"canvas", "next", "how", "look", "from", "mix", "wiping"} <= set(reached)

@@ -142,6 +142,7 @@ class Live {
       case "colours": await this.recolour(message); break;
       case "light":
         await this.sun?.relight(message);
+        this.stale.add(message.name);
         if (message.name === "Now" && message.version !== null) this.thrust("Now");
         break;
       case "state":
