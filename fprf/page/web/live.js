@@ -189,7 +189,7 @@ class Live {
       return;
     }
     const { head, parts } = await unpacked(await asked("/scene"), (share) => wait("scene", "Fetching the scene", share));
-    wait("scene", "Unpacking the scene");
+    wait("scene", "Unpacking the scene", 0);
     this.mode("scene");
     head.alone = true;
     if (before) await this.renew(before, scene, head, parts);
@@ -208,6 +208,7 @@ class Live {
     opened.scene = scene;
     const { place } = opened;
     await place.splats?.load(head, parts);
+    wait("scene", "Unpacking its colours", 0.7);
     await place.splats?.add("Captured", head.styles[0], parts["style-0"]);
     place.scene = head;
     place.touch();
@@ -224,6 +225,7 @@ class Live {
     try {
       const splats = new Splats(at("canvas"));
       await splats.load(head, parts);
+      wait("scene", "Unpacking its colours", 0.7);
       await splats.add("Captured", head.styles[0], parts["style-0"]);
       return splats;
     } catch (error) {
