@@ -74,7 +74,8 @@ def hours() -> Any:
 
 @pytest.fixture
 def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
-    found = opened(browser, written(tmp_path / "page.html", seen(ball(2000, 1)), suns=SUNS))
+    path = written(tmp_path / "page.html", seen(ball(2000, 1)), suns=SUNS)
+    found = opened(browser, path, 1000, 700)
     found.keyboard.press("0")
     found.keyboard.press("l")
     yield found
@@ -84,7 +85,7 @@ def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
 
 def beside(page: Any) -> np.ndarray:
     """What is seen of the scene beside the panel."""
-    return pixels(page)[100:380, 60:260]
+    return pixels(page)[100:380, 60:400]
 
 
 def shown(page: Any) -> Any:
