@@ -122,10 +122,10 @@ def packed_light(
     return PackedLight(met, head)
 
 
-def packed_day(illumination: Illumination, gaussians: Gaussians, suns: int, noon: float) -> Suns:
-    """A day with so many suns, of which the highest stands at the azimuth `noon` in degrees."""
+def packed_day(illumination: Illumination, gaussians: Gaussians, suns: int) -> Suns:
+    """A day with so many suns; at noon most of what the views show is lit."""
     lights = []
-    for hour in day(suns, noon):
+    for hour in day(suns, illumination.azimuth):
         light = packed_light(illumination, gaussians, hour.config)
         place = {"hour": hour.hour, "at": [hour.azimuth, hour.elevation], "met": light.met is not None}
         lights.append(PackedLight(light.met, {**light.head, **place}))

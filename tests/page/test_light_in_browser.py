@@ -12,6 +12,7 @@ from pages import seen, street, written
 from splat_ball import ball
 from test_page_in_browser import drawn, inside, opened, pixels, psnr, rasterised
 
+from fprf.light.day import day as hours_of
 from fprf.page.pack import pack
 from fprf.page.suns import packed_day
 from fprf.splats.relighting import relit_harmonics
@@ -38,13 +39,13 @@ def test_a_sun_draws_what_the_rasteriser_draws(browser: Any, tmp_path: Path, kin
     scene = seen({"ball": ball(3000, 1), "street": street(2000)}[kind])
     scene = inside(scene) if kind == "street" else scene
     known = scene.light_found
-    day = packed_day(known, scene.gaussians, SUNS, 0.0)
+    day = packed_day(known, scene.gaussians, SUNS)
     page = opened(browser, written(tmp_path / "page.html", scene, suns=SUNS))
     order = pack(scene.gaussians).order
     for light in (day.day[2], day.day[-1]):
         hour = light.head["hour"]
         found = torch.tensor(page.evaluate(GAINS, hour)).view(-1, 4)[:, :3]
-        config = next(each.config for each in hours() if each.hour == hour)
+        config = next(each.config for each in hours_of(SUNS, known.azimuth) if each.hour == hour)
         gain = known.gain(scene.gaussians, config)
         assert float((found - gain[order]).abs().mean()) < 0.02
         lit = rasterised(scene, 2, relit_harmonics(scene.gaussians.harmonics, gain))
@@ -64,12 +65,6 @@ def test_a_sun_draws_what_the_rasteriser_draws(browser: Any, tmp_path: Path, kin
     assert psnr(drawn(page, scene, 2, {"first": "Captured", "blend": 0}), plain) > 38
     assert page.errors == []
     page.close()
-
-
-def hours() -> Any:
-    from fprf.light.day import day
-
-    return day(SUNS, 0.0)
 
 
 @pytest.fixture
@@ -99,13 +94,14 @@ def test_the_sun_is_dragged_and_moved_by_keys(page: Any) -> None:
     dome = page.locator("#dome").bounding_box()
     x = dome["x"] + dome["width"] / 2
     y = dome["y"] + dome["height"] / 2
-    # Near the rim on the left: the morning, with a low sun; the path leads over the far side.
+    # To where the sun stands in the morning.
+    spot = page.evaluate("() => fprf.stage.light.panel.spot(sunAt(fprf.stage.light.head.day, 8))")
     page.mouse.move(x, y)
     page.mouse.down()
-    page.mouse.move(x - 0.42 * dome["width"], y - 4, steps=4)
+    page.mouse.move(x + spot[0] / 200 * dome["width"], y + spot[1] / 200 * dome["height"], steps=4)
     page.mouse.up()
     morning = shown(page)
-    assert morning["name"] == "" and morning["hour"] < 8.5 and morning["at"][1] < 35
+    assert morning["name"] == "" and morning["hour"] == pytest.approx(8, abs=0.3)
     assert np.abs(beside(page) - before).mean() > 0.005
     sun = page.locator("#sun")
     assert sun.evaluate("node => node === document.activeElement")

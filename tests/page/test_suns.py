@@ -103,7 +103,7 @@ def test_a_day_has_no_such_number_of_suns(count: int) -> None:
 
 def test_a_page_holds_a_byte_a_sun_of_the_gaussians_that_it_shows(tmp_path: Path) -> None:
     scene = seen(ball(3000))
-    suns = packed_day(scene.light_found, scene.gaussians, 8, 0.0)
+    suns = packed_day(scene.light_found, scene.gaussians, 8)
     some = torch.tensor([5, 3, 2999])
     held = np.frombuffer(zlib.decompress(suns.section(some)), np.uint8).reshape(10, 3)
     assert (held[:2] == suns.surfaces[:, some.numpy()]).all()

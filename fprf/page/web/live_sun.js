@@ -16,6 +16,8 @@ class LiveSun {
     // While the sun is dragged the panel goes ahead of the server, and so does what is wanted.
     this.moving = false;
     this.wanted = null;
+    // Where the slider of the time was last.
+    this.hour = null;
     // When the last wish was sent, and how long its light took to be shown.
     this.asked = 0;
     this.milliseconds = 0;
@@ -55,6 +57,7 @@ class LiveSun {
   get named() { return this.live.state.sun.light; }
 
   time(hour, moving) {
+    this.hour = hour;
     const sun = sunAt(this.panel.day, hour).map((x) => Math.round(10 * x) / 10);
     if (sun[1] >= LEAST_ELEVATION) this.wish({ light: null, sun }, moving);
     else this.wish({ light: "blue-hour", sun: null }, moving);
@@ -86,12 +89,18 @@ class LiveSun {
 
   show({ light, sun, strength }, place = null) {
     const shown = sun ?? place, { day } = this.panel;
-    let hour = null;
+    let hour = light === "blue-hour" ? this.dusk : null;
     if (sun) {
       const near = hourAt(day, sun);
       if (dot(directionOf(sunAt(day, near)), directionOf(sun)) > Math.cos(ON_THE_WAY * Math.PI / 180)) hour = near;
     }
     this.panel.show({ name: light ?? (sun ? "" : "captured"), at: shown, hour, strength });
+  }
+
+  /** The time of a blue hour: that of the slider, if it was moved to one of the two, else the evening. */
+  get dusk() {
+    const { day } = this.panel;
+    return this.hour !== null && sunAt(day, this.hour)[1] < LEAST_ELEVATION ? this.hour : day.at(-1).hour;
   }
 
   /** Fetch the light of a look and show it; without a version it has none. */
