@@ -80,7 +80,7 @@ const gainsOf = ({ level, open, head }, parts, captured, strength) => {
 
 /** The two lights of a day around a time, and how far it lies on the way from one to the other. */
 const aroundHour = (day, hour) => {
-  const next = clamped(day.findIndex((each) => each.hour >= hour), 1, day.length - 1);
+  const found = day.findIndex((each) => each.hour >= hour), next = found < 0 ? day.length - 1 : Math.max(1, found);
   const [one, two] = [day[next - 1], day[next]];
   return { at: next - 1, way: clamped((hour - one.hour) / (two.hour - one.hour), 0, 1) };
 };
