@@ -39,7 +39,7 @@ class DemoConfig(OverwriteConfig):
     """Training time."""
     downscale: int | float = 1
     """The photographs, 356x634, are reduced by this factor."""
-    megabytes: float = 3.8
+    megabytes: float = 4.8
     """Size of the page, at most; Gaussians that show least are left out of it."""
     suns: int = 12
     """Suns of a day on the page, from 2 to 64; one chooses the time there. 0 = none."""

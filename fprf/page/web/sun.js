@@ -116,7 +116,7 @@ const clock = (hour) => {
 };
 
 /**
- * The panel of the light: a dome as seen from above, on which one looks up, with the sun on it; the time of day; the strength;
+ * The panel of the light: a map of the sky with what is ahead at its top and the sun on it; the time of day; the strength;
  * named lights. What it shows is told by `show`; what somebody wants is told to `on`.
  *
  * @typedef {{name: string, at: ?number[], hour: ?number, strength: number}} ShownLight
