@@ -131,6 +131,10 @@ class RunConfig:
         largest = int(scene.cameras.size.prod(1).max())
         return replace(self, downscale=max(1, math.ceil(math.sqrt(largest / _MAX_IMAGE_PIXELS))))
 
+    def calibrated(self, scene: "ParsedScene") -> "ParsedScene":
+        """The scene with what a planned config corrects in its cameras; here as it is."""
+        return scene
+
     def described(self) -> str:
         """Describe the plan beyond the views and their size, for the line that is shown before training."""
         return ""

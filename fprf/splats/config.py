@@ -82,7 +82,7 @@ class GaussiansConfig(RunConfig):
     """3D Gaussians, trained from photographs."""
 
     kind: ClassVar[str] = "gaussians"
-    open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes")
+    open: ClassVar[tuple[str, ...]] = ("downscale", "cap", "passes", "k1")
 
     device: str = "auto"
     """cpu, cuda, or auto. On CUDA they are trained where gsplat is installed (`pip install 'fprf[cuda]'`),
@@ -109,6 +109,11 @@ class GaussiansConfig(RunConfig):
     in distances that views commonly see. It falls to a tenth. 0 = they are as the capture says, 0.002 suits
     poses that are off by some pixels. none = 0.0005 where a trial finds, by pixels that it left out, that
     poses are off; never in cells.
+    """
+    k1: float | None = None
+    """Radial distortion of views that come without a lens, within 0.3 of 0: tangents r from the axis are shown at
+    r (1 + k1 r²). none = that with which features matched between posed views lie on their epipolar lines, where it
+    clearly fits better than none.
     """
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed
@@ -187,6 +192,8 @@ class GaussiansConfig(RunConfig):
             between(name, getattr(self, name), 0.0, 1.0)
         if self.poses is not None:
             between("poses", self.poses, 0.0, 1.0)
+        if self.k1 is not None:
+            between("k1", self.k1, -0.3, 0.3)
         between("overview", self.overview, 0.0, 0.9)
         for part in self.background:
             between("background", part, 0.0, 1.0)
@@ -223,6 +230,12 @@ class GaussiansConfig(RunConfig):
         from .plan import plan
 
         return plan(self, scene, device)
+
+    def calibrated(self, scene: "ParsedScene") -> "ParsedScene":
+        """With `k1` in the views that come without a lens."""
+        from .lens_estimate import with_k1
+
+        return replace(scene, cameras=with_k1(scene.cameras, self.k1 or 0.0))
 
     @property
     def may_refine(self) -> bool:
@@ -263,4 +276,5 @@ class GaussiansConfig(RunConfig):
         return min(self.most_steps, self.most_passes * views)
 
     def described(self) -> str:
-        return f", up to {self.most:,} Gaussians"
+        lens = f", a lens with k1 {self.k1:.4f}" if self.k1 else ""
+        return f", up to {self.most:,} Gaussians{lens}"

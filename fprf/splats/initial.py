@@ -181,7 +181,6 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     """Points triangulated from SIFT matches between neighbouring training views."""
     # Pictures without their lenses: triangulation is that of pinholes.
     views = scene.train.tolist()
-    detector = cv2.SIFT.create(nfeatures=_MAX_SIFT_FEATURES, contrastThreshold=_SIFT_CONTRAST)
     cameras = {}
     for view in views:
         cameras[view] = covering(scene.cameras, view, 1e-6)
@@ -191,18 +190,11 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}
     for view in views:
-        keypoints, described = detector.detectAndCompute(
-            cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), None
-        )
-        if described is None or len(keypoints) < 2:
+        found = root_sift(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY))
+        if len(found.places) < 2:
             continue
-        parts = []
-        for each in keypoints:
-            parts.append(each.pt)
-        places[view] = np.array(parts, np.float64) + 0.5
-        features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(
-            np.float32
-        )  # RootSIFT
+        places[view] = found.places
+        features[view] = found.descriptors
     # Each view is matched with the few that stand near and look the same way.
     centre = {}
     for v in views:
@@ -225,7 +217,7 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
             if (j, i) in done:
                 continue
             done.add((i, j))
-            p, q = _pairs(features[i], features[j])
+            p, q = mutual_matches(features[i], features[j])
             if not len(p):
                 continue
             # Points of both, in the colours of the first.
@@ -244,10 +236,37 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     return Points(np.concatenate(positions), np.concatenate(colours))
 
 
-def _pairs(
+class Features(NamedTuple):
+    """F features of a picture."""
+
+    places: Annotated[Doubles, "F 2"]
+    """Pixels, whose centres lie at +0.5."""
+    descriptors: Annotated[NDArray[np.float32], "F 128"]
+    """Of unit length."""
+
+
+def root_sift(grey: Annotated[NDArray[np.uint8], "H W"]) -> Features:
+    """SIFT features with square roots of their descriptors (Arandjelovic and Zisserman 2012)."""
+    detector = cv2.SIFT.create(nfeatures=_MAX_SIFT_FEATURES, contrastThreshold=_SIFT_CONTRAST)
+    keypoints, described = detector.detectAndCompute(grey, None)
+    if described is None or not len(keypoints):
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    parts = []
+    for each in keypoints:
+        parts.append(each.pt)
+    share = described / np.maximum(described.sum(1, keepdims=True), 1e-9)
+    return Features(np.array(parts, np.float64) + 0.5, np.sqrt(share).astype(np.float32))
+
+
+def mutual_matches(
     first: NDArray[np.float32], second: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Mutual best matches whose second best is clearly worse (Lowe's ratio, 0.85)."""
+    """Mutual best matches whose second best is clearly worse (Lowe's ratio, 0.85); none of less than two
+    features.
+    """
+    if min(len(first), len(second)) < 2:
+        none = np.zeros(0, np.int64)
+        return none, none
     alike = first @ second.T
     rows = np.arange(len(first))
     # The two best matches of each; distances of unit vectors follow from their cosines.

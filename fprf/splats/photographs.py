@@ -24,7 +24,7 @@ from ..ops.rasterise.rendering import Pinhole
 from ..ops.rasterise.training import Floats, Target, target_of
 from .blur import blurred_views
 from .config import GaussiansConfig
-from .pinholes import covering, undistorted
+from .pinholes import drawn_as, undistorted
 
 Masks = dict[int, NDArray[np.bool_]]
 """Masks [H W] by view."""
@@ -52,7 +52,7 @@ class PhotographLevel(Mapping[int, Target]):
 
 
 class _Straightened(NamedTuple):
-    """A photograph without its lens, as 8-bit pixels."""
+    """A photograph for the rasteriser's camera, as 8-bit pixels."""
 
     camera: Pinhole
     image: Image
@@ -196,8 +196,8 @@ def make_levels(
 def _straighten(
     scene: ParsedScene, view: int, photograph: Image, masks: Masks, skies: Masks, near: float
 ) -> _Straightened:
-    """A photograph and its masks without their lens: what lies beyond the lens's picture does not count."""
-    camera = covering(scene.cameras, view, near)
+    """A photograph and its masks as `drawn_as` shows them: what lies beyond a lens's picture does not count."""
+    camera = drawn_as(scene.cameras, view, near)
     image, valid = undistorted(scene.cameras, view, photograph, camera)
 
     def mask_of(masks: Masks) -> NDArray[np.bool_] | None:

@@ -1,4 +1,5 @@
-"""Size of the photographs and number of Gaussians that a time on this machine is best used for.
+"""Size of the photographs and number of Gaussians that a time on this machine is best used for; the lens of captures
+that come without one (`lens_estimate`).
 
 P pixels of a photograph, V training views, N Gaussians. On the machine that the constants are meant for a step
 takes A s P + B N, where s is the share of the full size's pixels that it sees: the first steps see reduced
@@ -21,6 +22,7 @@ import torch
 from ..ops.rasterise.gsplat import target_on, trainable, usable
 from ..ops.rasterise.reference import Pinhole
 from ..ops.rasterise.training import compile_beside
+from .lens_estimate import estimate_k1
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import ParsedScene
@@ -99,6 +101,8 @@ def plan(config: "GaussiansConfig", scene: "ParsedScene", device: torch.device) 
     More minutes never give smaller photographs, fewer Gaussians or fewer steps.
     """
     sizes = scene.cameras.size[scene.train]
+    if config.k1 is None:
+        config = replace(config, k1=estimate_k1(scene))
     if not len(sizes):
         return replace(config, downscale=config.downscale or 1, cap=config.most, passes=config.most_passes)
     views = len(sizes)

@@ -18,7 +18,7 @@ from ..datamanagers.basis import Basis
 from ..datamanagers.scene import ParsedScene
 from ..interfaces import Encoder
 from ..ops.rasterise.gsplat import usable
-from ..rendering.cameras import Cameras, pixel_grid
+from ..rendering.cameras import Cameras, directions_of, intrinsics_of, pixel_grid
 from ..rendering.renderer import enlarged
 from ..scenes import Scene, SceneView, Values
 from ..style.dictionary import Encoders
@@ -30,7 +30,7 @@ from ..types import Origin, View
 from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
 from .levels import Levels, StyledLevels
-from .pinholes import camera_of, cover, distorted
+from .pinholes import camera_of, cover, covering, distorted
 from .relighting import Illumination, captured_light_note, find_illumination, mixed_gain, relit_harmonics
 from .restyle import ColourEncoder, restyled_harmonics
 from .semantics import Semantics
@@ -202,21 +202,27 @@ class SplatScene(Scene):
         if share < 1:
             small = cameras.select(torch.tensor([view])).scaled(1 / share)
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
-        # A lens is drawn through a pinhole that covers it, and brought to its pixels in the end.
+        # A lens of more than one radial term is drawn through a pinhole that covers it, and brought to its pixels
+        # in the end.
         camera, place = cover(cameras, view, self.near)
         if self.merged is None:
             shown = self._there
         else:
-            shown = self._detail.select(camera, self.merged).to(self.drawn_on)
+            seen = covering(cameras, view, self.near)
+            shown = self._detail.select(seen, self.merged).to(self.drawn_on)
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
         colour = drawn.image.cpu()
         along = drawn.depth.cpu()
         opacity = drawn.opacity.cpu()
         # Depths are along z; those of a view along its rays, whose lengths are these where z is 1.
-        inverse = camera.intrinsics.inverse().float()
-        x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
-        y = (torch.arange(camera.height) + 0.5) * inverse[1, 1] + inverse[1, 2]
-        depth = along * (x.square() + y.square()[:, None] + 1).sqrt()
+        if place is None:
+            ahead = directions_of(intrinsics_of(cameras, view), torch.device("cpu"))[:, 2]
+            depth = along / -ahead.view_as(along).float()
+        else:
+            inverse = camera.intrinsics.inverse().float()
+            x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
+            y = (torch.arange(camera.height) + 0.5) * inverse[1, 1] + inverse[1, 2]
+            depth = along * (x.square() + y.square()[:, None] + 1).sqrt()
         shape = torch.stack([depth, opacity], -1)
         if place is not None:
             colour = distorted(colour, place)

@@ -68,6 +68,7 @@ def read_whole_scene(config: RunConfig) -> ParsedScene:
 
 def scene_at_size(config: RunConfig, whole: ParsedScene, saved: Facts | None = None) -> ParsedScene:
     """A scene that was read at its own size, at that of a planned config, about the origin of a run that goes on."""
+    whole = config.calibrated(whole)
     size = config.downscale or 1
     if size == 1:
         scene = whole

@@ -24,7 +24,7 @@ STOP = 1e-3
 Tensors = list[Tensor]
 
 
-def camera(width: int = 40, height: int = 30, near: float = 0.01) -> rasterise.Pinhole:
+def camera(width: int = 40, height: int = 30, near: float = 0.01, k1: float = 0.0) -> rasterise.Pinhole:
     """At (-1.3, 0.2, -3.8), turned by 0.3 about y; different focal lengths, centre off the middle."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[0, 0] = pose[2, 2] = math.cos(0.3)
@@ -33,7 +33,7 @@ def camera(width: int = 40, height: int = 30, near: float = 0.01) -> rasterise.P
     intrinsics = torch.tensor(
         [[0.95 * width, 0, 0.48 * width], [0, 1.37 * height, 0.53 * height], [0, 0, 1]], dtype=torch.float64
     )
-    return rasterise.Pinhole(intrinsics, pose, width, height, near)
+    return rasterise.Pinhole(intrinsics, pose, width, height, near, k1)
 
 
 def cloud(count: int = 60, bands: int = 16, channels: int = 0, size: float = -1.5, seed: int = 0) -> Tensors:
@@ -59,16 +59,19 @@ def exact(given: Tensors) -> Tensors:
 
 
 @pytest.mark.parametrize(
-    ("bands", "channels", "antialiased"), [(16, 9, False), (9, 0, True), (4, 8, True), (1, 1, False)]
+    ("bands", "channels", "antialiased", "k1"),
+    [(16, 9, False, 0.0), (9, 0, True, 0.3), (4, 8, True, -0.4), (1, 1, False, 0.0)],
 )
-def test_images_and_gradients_are_those_of_float64(bands: int, channels: int, antialiased: bool) -> None:
+def test_images_and_gradients_are_those_of_float64(
+    bands: int, channels: int, antialiased: bool, k1: float
+) -> None:
     """A weight is a product over what lies before; each factor errs by at most ROUGH alpha / (1 - alpha),
     which stays below ROUGH for the alphas here, and tens of Gaussians lie on a pixel: 2 ROUGH of the largest
     value, on average; gradients have twice as many factors. A pixel of thousands may lie where one alpha is
     cut at 1/255.
     """
     given = cloud(bands=bands, channels=channels)
-    view = camera()
+    view = camera(k1=k1)
     pulls = torch.Generator().manual_seed(1)
     results = []
     weights = [
@@ -91,9 +94,10 @@ def test_images_and_gradients_are_those_of_float64(bands: int, channels: int, an
             assert (one.double() - other).norm() < 4 * ROUGH * other.norm()
 
 
-def test_gradients_of_the_plain_form_are_finite_differences() -> None:
+@pytest.mark.parametrize("k1", [0.0, -0.3])
+def test_gradients_of_the_plain_form_are_finite_differences(k1: float) -> None:
     given = exact(cloud(count=7, bands=16, channels=2, size=-0.7))
-    view = camera(12, 9)
+    view = camera(12, 9, k1=k1)
     # Far from the cut at 1/255: everything covers everything.
     given[2], given[3] = given[2] + 1.5, given[3].abs() + 1
 

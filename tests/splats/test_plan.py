@@ -16,7 +16,7 @@ import fprf.splats.plan as module
 from fprf.cli.main import main
 from fprf.splats.config import GaussiansConfig
 
-CONFIG = GaussiansConfig()
+CONFIG = GaussiansConfig(k1=0.0)
 
 
 @pytest.fixture(autouse=True)

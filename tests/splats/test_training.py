@@ -52,7 +52,7 @@ def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: ParsedScene) -> 
 SECOND: dict[str, Any] = {
     "initial": 200, "cap": 500, "degree": 2, "ssim": 0.0, "coarse": 0.0, "grow": 0.9, "relocate_every": 30, "rate": 0.5,
     "surroundings": 0, "pixels_per_gaussian": 40,
-    "background": (1.0, 0.0, 0.0), "seed": 1, "masks": False, "tones": True, "poses": 1e-3,
+    "background": (1.0, 0.0, 0.0), "seed": 1, "masks": False, "tones": True, "poses": 1e-3, "k1": 0.2,
 }  # fmt: skip
 
 
@@ -66,7 +66,8 @@ def test_every_field_changes_something(
         scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
     end = STEPS if name in ("background", "cap", "grow", "relocate_every", "pixels_per_gaussian") else 3
     first, second = (
-        stepped(build(each, scene), 0, end) for each in (config, replace(config, **{name: SECOND[name]}))
+        stepped(build(each, each.calibrated(scene)), 0, end)
+        for each in (config, replace(config, **{name: SECOND[name]}))
     )
     assert not equal(first.gaussians(), second.gaussians())
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.scene import ParsedScene
-from fprf.rendering.cameras import Cameras, ideal_cameras, project
+from fprf.rendering.cameras import Cameras, grid_rays, ideal_cameras, project
 from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs, pinholes
 from fprf.splats.config import GaussiansConfig
@@ -19,6 +20,7 @@ from fprf.splats.gaussians import Gaussians
 from fprf.splats.initial import initial_points
 from fprf.splats.photographs import load_photographs, make_levels
 from fprf.splats.pinholes import camera_of
+from fprf.splats.scene import SplatScene
 from fprf.splats.setup import scene_scale
 from fprf.training.prepare import read_scene
 
@@ -61,6 +63,7 @@ def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
     """
     distortion = torch.zeros(len(scene.paths), 6, dtype=torch.float64)
     distortion[:, 0] = -0.2
+    distortion[:, 1] = 1e-6
     cameras = replace(scene.cameras, distortion=distortion, lens=torch.ones_like(scene.cameras.lens))
     cameras = cameras.resized(torch.tensor([[160, 120]]).expand(len(cameras), 2))
     pose = cameras.pose[0]
@@ -88,6 +91,43 @@ def test_a_lens_moves_pixels_where_projection_says(scene: ParsedScene) -> None:
     back, inside = pinholes.undistorted(cameras, 0, bytes_, camera_of(cameras, 0))
     assert inside is not None and 0.8 < inside.mean() < 1.01
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
+    # With k1 alone it is drawn where it lies, at once.
+    cameras.distortion[:] = torch.tensor([0.1, 0, 0, 0, 0, 0])
+    camera, where = pinholes.cover(cameras, 0, 0.01)
+    assert where is None and camera.k1 == pytest.approx(0.1)
+    assert (
+        middle(draw(dot, camera).image) - project(cameras, torch.tensor([0]), place[None])[0][0]
+    ).norm() < 0.1
+    same, everywhere = pinholes.undistorted(cameras, 0, bytes_, camera)
+    assert same is bytes_ and everywhere is None
+
+
+def test_a_lens_that_folds_back_in_the_corners_is_drawn_through_a_pinhole() -> None:
+    cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64))
+    cameras.lens[:] = 1
+    for k1, direct in ((-0.1, True), (-0.4, False)):
+        cameras.distortion[:, 0] = k1
+        camera, place = pinholes.cover(cameras, 0, 0.01)
+        assert (camera.k1 == k1) == (place is None) == direct
+
+
+def absent() -> Any:
+    raise AssertionError("nobody asked for semantics")
+
+
+def test_depths_through_a_lens_are_along_the_rays_of_its_pixels() -> None:
+    """A wall across the axis: its depth along a ray is its distance over the ray's share along the axis."""
+    turn = torch.tensor([[1.0, 0, 0, 0]])
+    size = torch.log(torch.tensor([[50.0, 50.0, 1e-3]]))
+    wall = Gaussians(torch.tensor([[0.0, 0, -4]]), turn, size, torch.full((1,), 9.0), torch.ones(1, 1, 3))
+    cameras = ideal_cameras(torch.eye(3, 4, dtype=torch.float64)[None], 60.0, (80, 64))
+    cameras.lens[:] = 1
+    cameras.distortion[:, 0] = 0.2
+    ahead = -grid_rays(cameras, 0)[1][:, 2].view(64, 80)
+    for k2 in (0.0, 1e-9):
+        cameras.distortion[:, 1] = k2
+        shown = SplatScene(wall, False, cameras, ("one",), absent, absent, 80).render(cameras, 0)
+        assert torch.allclose(shown.depth.double(), 4 / ahead, rtol=2e-3)
 
 
 def test_surroundings_fill_what_no_photograph_shows(scene: ParsedScene) -> None:

@@ -38,6 +38,7 @@ from .forward_kernels import (
     Channels,
     alpha_of,
     axes,
+    bend,
     block_places,
     entry_of,
     footprint,
@@ -272,9 +273,10 @@ def _block_gradient(blocks, at, bands, view, summed):
     opposite.
     """
     mean, centre, scales, (qw, qx, qy, qz, q_inverse), world, camera = axes(blocks, at, view)
-    (u, v, near_u, near_v, inverse, fx, fy), (j00, j01, j02, j10, j11, j12), (xx0, yy0, xy, det0) = footprint(
+    tangents, (across, down), (j00, j01, j02, j10, j11, j12), (xx0, yy0, xy, det0) = footprint(
         centre, camera, view
     )
+    u, v, near_u, near_v, inverse, fx, fy = tangents
     xx = xx0 + BLUR
     yy = yy0 + BLUR
     det = det0 + BLUR * (xx0 + yy0) + BLUR * BLUR
@@ -317,17 +319,37 @@ def _block_gradient(blocks, at, bands, view, summed):
     h10 = h10 * fy
     h11 = h11 * fy
     h12 = h12 * fy
+    # Through the lens: of its derivative uu, uv, vv, which moves with the tangents, and of the axes before it.
+    of_uu = h00 * across[0] + h01 * across[1] + h02 * across[2]
+    of_uv = h00 * down[0] + h01 * down[1] + h02 * down[2]
+    of_uv = of_uv + h10 * across[0] + h11 * across[1] + h12 * across[2]
+    of_vv = h10 * down[0] + h11 * down[1] + h12 * down[2]
+    twice = 2 * view[25]
+    of_near_u = twice * (near_u * (3 * of_uu + of_vv) + near_v * of_uv)
+    of_near_v = twice * (near_v * (of_uu + 3 * of_vv) + near_u * of_uv)
+    uu, uv, vv = bend(near_u, near_v, view)
+    p00 = uu * h00 + uv * h10
+    p01 = uu * h01 + uv * h11
+    p02 = uu * h02 + uv * h12
+    p10 = uv * h00 + vv * h10
+    p11 = uv * h01 + vv * h11
+    p12 = uv * h02 + vv * h12
     inside_u = where_greater(u, view[19], where_greater(view[20], u, splat(u, 1), 0), 0)
     inside_v = where_greater(v, view[21], where_greater(view[22], v, splat(v, 1), 0), 0)
-    g_u = view[12] * g_px - inside_u * (camera[6] * h00 + camera[7] * h01 + camera[8] * h02)
-    g_v = view[13] * g_py - inside_v * (camera[6] * h10 + camera[7] * h11 + camera[8] * h12)
+    of_near_u = of_near_u - (camera[6] * p00 + camera[7] * p01 + camera[8] * p02)
+    of_near_v = of_near_v - (camera[6] * p10 + camera[7] * p11 + camera[8] * p12)
+    uu, uv, vv = bend(u, v, view)
+    g_px = view[12] * g_px
+    g_py = view[13] * g_py
+    g_u = uu * g_px + uv * g_py + inside_u * of_near_u
+    g_v = uv * g_px + vv * g_py + inside_v * of_near_v
     g_x = g_u * inverse
     g_y = g_v * inverse
     g_z = g_z - (u * g_u + v * g_v) * inverse
-    b0 = -(near_u * h00 + near_v * h10)
-    b1 = -(near_u * h01 + near_v * h11)
-    b2 = -(near_u * h02 + near_v * h12)
-    columns = ((h00, h10, b0), (h01, h11, b1), (h02, h12, b2))
+    b0 = -(near_u * p00 + near_v * p10)
+    b1 = -(near_u * p01 + near_v * p11)
+    b2 = -(near_u * p02 + near_v * p12)
+    columns = ((p00, p10, b0), (p01, p11, b1), (p02, p12, b2))
     n = []
     for r in range(3):
         n.append([view[r] * h0 + view[3 + r] * h1 + view[6 + r] * b for h0, h1, b in columns])

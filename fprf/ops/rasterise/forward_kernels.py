@@ -2,8 +2,8 @@
 their bridge.
 
 Blocks     Parameters of LANES Gaussians, a row each (`layout`).
-Camera     25 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
-           the tangents (left right top bottom) 19-22, near 23, and 1 for anti-aliasing 24.
+Camera     26 numbers: rotation world to camera 0-8, translation 9-11, fx fy cx cy 12-15, place in the world 16-18, limits of
+           the tangents (left right top bottom) 19-22, near 23, 1 for anti-aliasing 24, radial distortion k1 25.
 Splats, tiles and entries are those of `tile_kernels`.
 """
 
@@ -88,8 +88,8 @@ def axes(blocks, at, view):
 
 
 def footprint(centre, camera, view):
-    """The image position u, v (tangents), the axes in pixels j, their covariance xx, yy, xy and its
-    determinant, blur apart.
+    """The image position u, v (tangents without the lens), the axes in pixels j, their covariance xx, yy, xy and
+    its determinant, blur apart.
 
     The determinant is the squared length of a cross product: xx yy - xy^2 would lose the digits of thin
     ellipses.
@@ -102,8 +102,11 @@ def footprint(centre, camera, view):
     near_v = minimum(maximum(v, view[21]), view[22])
     fx = view[12] * inverse
     fy = view[13] * inverse
-    j00, j01, j02 = (fx * (camera[c] - near_u * camera[6 + c]) for c in range(3))
-    j10, j11, j12 = (fy * (camera[3 + c] - near_v * camera[6 + c]) for c in range(3))
+    across = [camera[c] - near_u * camera[6 + c] for c in range(3)]
+    down = [camera[3 + c] - near_v * camera[6 + c] for c in range(3)]
+    uu, uv, vv = bend(near_u, near_v, view)
+    j00, j01, j02 = (fx * (uu * across[c] + uv * down[c]) for c in range(3))
+    j10, j11, j12 = (fy * (uv * across[c] + vv * down[c]) for c in range(3))
     xx = j00 * j00 + j01 * j01 + j02 * j02
     yy = j10 * j10 + j11 * j11 + j12 * j12
     xy = j00 * j10 + j01 * j11 + j02 * j12
@@ -112,9 +115,16 @@ def footprint(centre, camera, view):
     c2 = j00 * j11 - j01 * j10
     return (
         (u, v, near_u, near_v, inverse, fx, fy),
+        (across, down),
         (j00, j01, j02, j10, j11, j12),
         (xx, yy, xy, c0 * c0 + c1 * c1 + c2 * c2),
     )
+
+
+def bend(u, v, view):
+    """Derivatives of u (1 + k1 r^2) by u and v, and of v (1 + k1 r^2) by v."""
+    k1 = view[25]
+    return 1 + k1 * (3 * u * u + v * v), 2 * k1 * u * v, 1 + k1 * (u * u + 3 * v * v)
 
 
 def opacity(logit):
@@ -126,7 +136,7 @@ def opacity(logit):
 def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     # Sigma' and its inverse, whose determinants differ by the blur.
     mean, centre, _, _, _, camera = axes(blocks, at, view)
-    (u, v, *_), _, (xx0, yy0, xy, det0) = footprint(centre, camera, view)
+    (u, v, *_), _, _, (xx0, yy0, xy, det0) = footprint(centre, camera, view)
     xx = xx0 + BLUR
     yy = yy0 + BLUR
     det = det0 + BLUR * (xx0 + yy0) + BLUR * BLUR
@@ -140,13 +150,15 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     reach = (highest - LOG_MIN) * (2 * _LN2)
     half_width = square_root(maximum(reach, 0) * xx)
     half_height = square_root(maximum(reach, 0) * yy)
-    px = view[12] * u + view[14]
-    py = view[13] * v + view[15]
+    square = view[25] * (u * u + v * v)
+    px = view[12] * (u * (1 + square)) + view[14]
+    py = view[13] * (v * (1 + square)) + view[15]
     # Half the width, or why there is nothing to draw.
     shown = where_greater(as_float(width), px - half_width, half_width, -OUTSIDE)
     shown = where_greater(px + half_width, 0, shown, -OUTSIDE)
     shown = where_greater(as_float(height), py - half_height, shown, -OUTSIDE)
     shown = where_greater(py + half_height, 0, shown, -OUTSIDE)
+    shown = where_greater(1 + 3 * square, 0, shown, -OUTSIDE)  # beyond it the lens folds back
     shown = where_greater(centre[2], view[23], shown, -BEHIND)
     shown = where_greater(reach, 0, shown, -FAINT)
     shown = where_greater(MAX_SQUARE_PIXELS, xx + yy, shown, -INVALID)

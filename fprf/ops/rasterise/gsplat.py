@@ -20,7 +20,7 @@ from ..photometric import SSIM_C1, SSIM_C2, WINDOW, WINDOW_SIGMA
 from ..simd import LANES
 from . import ADAM_DECAYS, ADAM_EPSILON, BLUR, MAX_COORDINATE, MAX_LOG
 from .layout import FIXED
-from .reference import Pinhole
+from .reference import Pinhole, rasterise_reference
 from .tile_kernels import SIDE
 from .training import (
     HARMONICS,
@@ -87,6 +87,17 @@ def rasterise_gsplat(
     """Composited values, the composited depth behind them, and the transmittance left, float32: as
     `rasterise_reference`.
     """
+    if camera.k1 != 0:  # gsplat draws pinholes alone
+        return rasterise_reference(
+            means,
+            quaternions,
+            log_scales,
+            logits,
+            values,
+            camera,
+            background,
+            antialiased=antialiased,
+        )
     camera = camera._replace(
         intrinsics=camera.intrinsics.to(means), world_to_camera=camera.world_to_camera.to(means)
     )
@@ -487,7 +498,7 @@ def _windowed(images: Annotated[Tensor, "C H W"], padding: int) -> Annotated[Ten
     return F.conv2d(columns, across, padding=(0, padding), groups=many)[0]
 
 
-def _camera(target: Target, numbers: Annotated[Tensor, "25"]) -> Pinhole:
+def _camera(target: Target, numbers: Annotated[Tensor, "26"]) -> Pinhole:
     """A photograph's camera on the device, from its numbers there (see `camera_array`)."""
     turn = numbers[:9].view(3, 3)
     shift = numbers[9:12, None]

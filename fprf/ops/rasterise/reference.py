@@ -7,7 +7,8 @@ Letters: N Gaussians, K harmonics of a colour channel (1, 4, 9 or 16), C feature
 
 alpha below 1/255 counts as 0. With `antialiased` o_i is multiplied by sqrt(det(Sigma - 0.3 I) / det Sigma):
 what the blur widens it makes fainter (Mip-Splatting). J is the projection's derivative at the mean, its
-tangents limited to 15 % beyond the image's edges, as in the published code.
+tangents limited to 15 % beyond the image's edges, as in the published code. A camera with radial distortion k1 shows
+the tangents (u, v) at (u, v) (1 + k1 (u^2 + v^2)), up to where that grows no more; J has the derivative of that too.
 """
 
 import math
@@ -30,7 +31,7 @@ _MIN_REACH = 1e-30
 
 
 class Pinhole(NamedTuple):
-    """A camera without distortion; a constant: nothing has a gradient in it."""
+    """A camera without distortion, or with a radial one; a constant: nothing has a gradient in it."""
 
     intrinsics: Annotated[Tensor, "3 3"]
     """fx, fy, cx, cy in pixels, pixel centres at +0.5; no skew."""
@@ -40,6 +41,8 @@ class Pinhole(NamedTuple):
     height: int
     near: float = 0.01
     """World distance along z up to which nothing is drawn."""
+    k1: float = 0.0
+    """Radial distortion: tangents r from the axis are shown at r (1 + k1 r^2)."""
 
 
 class Projected(NamedTuple):
@@ -114,8 +117,14 @@ def project_reference(
         2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy),
     ]  # fmt: skip
     axes = world[:3, :3] @ torch.stack(rows, -1).view(-1, 3, 3) * log_scales.exp()[:, None]
-    across = (fx / z)[:, None] * (axes[:, 0] - limited_u[:, None] * axes[:, 2])
-    down = (fy / z)[:, None] * (axes[:, 1] - limited_v[:, None] * axes[:, 2])
+    plain_across = axes[:, 0] - limited_u[:, None] * axes[:, 2]
+    plain_down = axes[:, 1] - limited_v[:, None] * axes[:, 2]
+    # The derivative of u (1 + k1 r^2) and v (1 + k1 r^2) by u and v.
+    bend_uu = 1 + camera.k1 * (3 * limited_u.square() + limited_v.square())
+    bend_uv = 2 * camera.k1 * limited_u * limited_v
+    bend_vv = 1 + camera.k1 * (limited_u.square() + 3 * limited_v.square())
+    across = (fx / z)[:, None] * (bend_uu[:, None] * plain_across + bend_uv[:, None] * plain_down)
+    down = (fy / z)[:, None] * (bend_uv[:, None] * plain_across + bend_vv[:, None] * plain_down)
     fine = fine & (across.square().sum(-1) + down.square().sum(-1) < MAX_SQUARE_PIXELS)
     across, down = (torch.where(fine[:, None], x, torch.ones_like(x)) for x in (across, down))
     xx = across.square().sum(-1)
@@ -128,11 +137,13 @@ def project_reference(
     if antialiased:
         opacity = opacity * (det_sharp / det_blurred + _SLOPE_EPSILON).sqrt()  # Mip-Splatting, Eq. 9
     covariance = torch.stack([xx + BLUR, xy, yy + BLUR], -1)
-    mean = torch.stack([fx * u + cx, fy * v + cy], -1)
+    square = u * u + v * v
+    stretch = 1 + camera.k1 * square
+    mean = torch.stack([fx * (u * stretch) + cx, fy * (v * stretch) + cy], -1)
     # Where alpha falls to 1/255: x^T Sigma^-1 x = 2 ln(255 o).
     reach = 2 * (opacity.detach() / MIN_ALPHA).clamp_min(_MIN_REACH).log()
     extent = (reach.clamp_min(0)[:, None] * covariance.detach()[:, ::2]).sqrt()
-    seen = fine & (depth > camera.near) & (reach > 0)
+    seen = fine & (depth > camera.near) & (reach > 0) & (1 + 3 * camera.k1 * square > 0)
     extent = torch.where(seen[:, None], extent, -torch.ones_like(extent))
     return Projected(mean, covariance, det_blurred, depth, opacity, extent)
 

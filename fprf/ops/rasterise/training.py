@@ -130,7 +130,7 @@ def camera_array(camera: "Pinhole", antialiased: bool) -> Floats:
         (camera.height - cy) / fy + TANGENT_MARGIN * camera.height / fy,
     ]
     place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
-    return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
+    return np.array([*place, *limits, camera.near, float(antialiased), camera.k1], np.float32)
 
 
 def _planes(image: NDArray[Any], behind: int) -> Floats:
@@ -388,7 +388,7 @@ def _compile(bands: int, part: str) -> None:
     """Run half of a step on nothing: a tile, and a block of Gaussians of which none is drawn; leave a
     mark.
     """
-    camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0], np.float32)
+    camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0, 0], np.float32)
     planes = np.zeros(3 * SIDE * SIDE + photometric.slack(SIDE), np.float32)
     left = np.zeros(SIDE * SIDE, np.float32)
     blocks, first, second, splats = np.zeros((4, (FIXED + 3 * bands) * LANES), np.float32)
