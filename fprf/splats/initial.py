@@ -190,7 +190,7 @@ def _matched(scene: ParsedScene, images: Mapping[int, Image]) -> Points:
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}
     for view in views:
-        found = root_sift(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY))
+        found = root_sift(np.asarray(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), np.uint8))
         if len(found.places) < 2:
             continue
         places[view] = found.places

@@ -161,8 +161,10 @@ def matched_views(scene: ParsedScene, groups: Sequence[Sequence[int]]) -> list[M
     views = sorted({view for group in groups for view in group})
     features = {}
     for view, image in zip(views, load_images(scene, (0.0, 0.0, 0.0), views), strict=True):
-        features[view] = root_sift(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY))
-    pairs = set()
+        features[view] = root_sift(
+            np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), np.uint8)
+        )
+    pairs: set[tuple[int, ...]] = set()
     for group in groups:
         pairs.update(itertools.combinations(sorted(group), 2))
     found = []
