@@ -8,6 +8,7 @@ so its sums have one order on any number of threads.
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
+import itertools
 import math
 from typing import Annotated, Any
 
@@ -263,7 +264,7 @@ def lift_values(
     on_threads(_lift_values, found, tiles.first_slot, tiles.total, out, stride, offset, channels, skipped)
 
 
-def _block_gradient(blocks, at, bands, view, summed):
+def _block_gradient(blocks, at, bands, lens, view, summed):
     """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth; and its
     part of the gradient of the camera: the turn about its own centre (rotation vector in camera axes), and
     the shift in the world.
@@ -274,7 +275,7 @@ def _block_gradient(blocks, at, bands, view, summed):
     """
     mean, centre, scales, (qw, qx, qy, qz, q_inverse), world, camera = axes(blocks, at, view)
     tangents, (across, down), (j00, j01, j02, j10, j11, j12), (xx0, yy0, xy, det0) = footprint(
-        centre, camera, view
+        centre, camera, view, lens
     )
     u, v, near_u, near_v, inverse, fx, fy = tangents
     xx = xx0 + BLUR
@@ -319,30 +320,31 @@ def _block_gradient(blocks, at, bands, view, summed):
     h10 = h10 * fy
     h11 = h11 * fy
     h12 = h12 * fy
-    # Through the lens: of its derivative uu, uv, vv, which moves with the tangents, and of the axes before it.
-    of_uu = h00 * across[0] + h01 * across[1] + h02 * across[2]
-    of_uv = h00 * down[0] + h01 * down[1] + h02 * down[2]
-    of_uv = of_uv + h10 * across[0] + h11 * across[1] + h12 * across[2]
-    of_vv = h10 * down[0] + h11 * down[1] + h12 * down[2]
-    twice = 2 * view[25]
-    of_near_u = twice * (near_u * (3 * of_uu + of_vv) + near_v * of_uv)
-    of_near_v = twice * (near_v * (of_uu + 3 * of_vv) + near_u * of_uv)
-    uu, uv, vv = bend(near_u, near_v, view)
-    p00 = uu * h00 + uv * h10
-    p01 = uu * h01 + uv * h11
-    p02 = uu * h02 + uv * h12
-    p10 = uv * h00 + vv * h10
-    p11 = uv * h01 + vv * h11
-    p12 = uv * h02 + vv * h12
+    # Through the lens: of the axes before it (p), and of its derivative uu, uv, vv, which moves with the tangents.
+    p00, p01, p02, p10, p11, p12 = (h00, h01, h02, h10, h11, h12)
+    of_near_u = 0
+    of_near_v = 0
+    g_u = view[12] * g_px
+    g_v = view[13] * g_py
+    if lens:
+        of_uu = h00 * across[0] + h01 * across[1] + h02 * across[2]
+        of_uv = h00 * down[0] + h01 * down[1] + h02 * down[2]
+        of_uv = of_uv + h10 * across[0] + h11 * across[1] + h12 * across[2]
+        of_vv = h10 * down[0] + h11 * down[1] + h12 * down[2]
+        twice = 2 * view[25]
+        of_near_u = twice * (near_u * (3 * of_uu + of_vv) + near_v * of_uv)
+        of_near_v = twice * (near_v * (of_uu + 3 * of_vv) + near_u * of_uv)
+        uu, uv, vv = bend(near_u, near_v, view)
+        p00, p01, p02 = (uu * x + uv * y for x, y in ((h00, h10), (h01, h11), (h02, h12)))
+        p10, p11, p12 = (uv * x + vv * y for x, y in ((h00, h10), (h01, h11), (h02, h12)))
+        uu, uv, vv = bend(u, v, view)
+        of_shown = g_u
+        g_u = uu * of_shown + uv * g_v
+        g_v = uv * of_shown + vv * g_v
     inside_u = where_greater(u, view[19], where_greater(view[20], u, splat(u, 1), 0), 0)
     inside_v = where_greater(v, view[21], where_greater(view[22], v, splat(v, 1), 0), 0)
-    of_near_u = of_near_u - (camera[6] * p00 + camera[7] * p01 + camera[8] * p02)
-    of_near_v = of_near_v - (camera[6] * p10 + camera[7] * p11 + camera[8] * p12)
-    uu, uv, vv = bend(u, v, view)
-    g_px = view[12] * g_px
-    g_py = view[13] * g_py
-    g_u = uu * g_px + uv * g_py + inside_u * of_near_u
-    g_v = uv * g_px + vv * g_py + inside_v * of_near_v
+    g_u = g_u - inside_u * (camera[6] * p00 + camera[7] * p01 + camera[8] * p02 - of_near_u)
+    g_v = g_v - inside_v * (camera[6] * p10 + camera[7] * p11 + camera[8] * p12 - of_near_v)
     g_x = g_u * inverse
     g_y = g_v * inverse
     g_z = g_z - (u * g_u + v * g_v) * inverse
@@ -398,14 +400,14 @@ def _block_gradient(blocks, at, bands, view, summed):
 
 
 @traced
-def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera, to):
+def _learn_block(blocks, first, second, weight, start, bands, lens, view, memory, rates, of_camera, to):
     at = start * (FIXED + 3 * bands)
     # Adam, whose second moment is weighted by how often a Gaussian was seen.
     w = load(weight, start)
     w = w + (1 - ADAM_DECAYS[1]) * (1 - w)
     store(weight, start, w)
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
-    rows, of_view = _block_gradient(blocks, at, bands, view, [*summed, 0])
+    rows, of_view = _block_gradient(blocks, at, bands, lens, view, [*summed, 0])
     for row, g in enumerate(of_view):
         store(of_camera, to + row * LANES, load(of_camera, to + row * LANES) + g)
     for row, g in enumerate(rows):
@@ -420,9 +422,9 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
 
 
 @traced
-def _write_gradient(blocks, at, bands, view, memory, out):
+def _write_gradient(blocks, at, bands, lens, view, memory, out):
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 4]
-    for row, g in enumerate(_block_gradient(blocks, at, bands, view, summed)[0]):
+    for row, g in enumerate(_block_gradient(blocks, at, bands, lens, view, summed)[0]):
         store(out, at + row * LANES, g)
 
 
@@ -435,7 +437,7 @@ def _add_block(found, first_slot, first, memory):
             _add(memory, lane * LANES, found, slot * SUMS)
 
 
-def _gradients(bands):
+def _gradients(bands, lens):
     @jit
     def gradients(counters, blocks, count, view, found, first_slot, out):
         memory = stack(_BLOCK_SUMS)
@@ -450,12 +452,12 @@ def _gradients(bands):
                         store(out, at + row * LANES, 0)
                 else:
                     _add_block(found, first_slot, first, memory)
-                    _write_gradient(blocks, at, bands, view, memory, out)
+                    _write_gradient(blocks, at, bands, lens, view, memory, out)
 
     return gradients
 
 
-def _adam(bands):
+def _adam(bands, lens):
     @jit
     def adam(counters, blocks, first, second, weight, count, view, found, first_slot, rates, of_camera):
         memory = stack(_BLOCK_SUMS)
@@ -467,21 +469,22 @@ def _adam(bands):
                 if first_slot[start + LANES] > first_slot[start]:
                     _add_block(found, first_slot, start, memory)
                     _learn_block(
-                        blocks, first, second, weight, start, bands, view, memory, rates, of_camera, begin // BLOCKS * CAMERA
+                        blocks, first, second, weight, start, bands, lens,
+                        view, memory, rates, of_camera, begin // BLOCKS * CAMERA
                     )  # fmt: skip
 
     return adam
 
 
-# By the number of harmonics.
-_GRADIENTS = {bands: _gradients(bands) for bands in (1, 4, 9, 16)}
-# By the number of harmonics.
-_ADAM = {bands: _adam(bands) for bands in (1, 4, 9, 16)}
+# By the number of harmonics, and 1 where there is a lens.
+_KEYS = tuple(itertools.product((1, 4, 9, 16), (0, 1)))
+_GRADIENTS = {key: _gradients(*key) for key in _KEYS}
+_ADAM = {key: _adam(*key) for key in _KEYS}
 
 
 def gradients(tiles: Tiles, blocks: Floats, bands: int, view: Floats, found: Floats, out: Floats) -> None:
     """The gradients of all Gaussians, in blocks, from the sums of their slots: shape, colour and depth."""
-    on_threads(_GRADIENTS[bands], blocks, tiles.total, view, found, tiles.first_slot, out)
+    on_threads(_GRADIENTS[bands, int(view[25] != 0)], blocks, tiles.total, view, found, tiles.first_slot, out)
 
 
 def adam(
@@ -506,7 +509,7 @@ def adam(
     # Of the Gaussians that a thread takes at a time, so that threads do not change the order of the sum.
     of_camera = np.zeros((-(-tiles.total // (BLOCKS * LANES)), CAMERA, LANES), np.float32)
     on_threads(
-        _ADAM[bands],
+        _ADAM[bands, int(view[25] != 0)],
         blocks,
         *moments,
         tiles.total,
@@ -522,4 +525,4 @@ def adam(
 
 def cache_path(bands: int) -> str:
     """The folder where numba keeps what it compiled of this module."""
-    return str(_ADAM[bands].stats.cache_path)
+    return str(_ADAM[bands, 0].stats.cache_path)
