@@ -36,7 +36,7 @@ _MAX_DISTANCE = 4.0
 """Distance from its epipolar line, without a lens, up to which a match is believed; by eye."""
 _MAX_K1 = 0.1
 """Largest distortion that is looked for: matches have to be found on the lines of no distortion; by eye."""
-_STEPS = 16
+_RANGE_PARTS = 16
 """Parts of the range that are tried first; the best one is then cut finer twice by as many."""
 _MAX_COST_RATIO = 0.99
 """Cost with a lens over that without one, up to which it is believed: llff_flower has 0.982 and llff_fern 0.976;
@@ -99,9 +99,9 @@ def best_k1(matches: Sequence[Matches], corner: float) -> float:
     best = 0.0
     width = _MAX_K1
     for _ in range(3):
-        tried = best + np.linspace(-width, width, _STEPS + 1)
+        tried = best + np.linspace(-width, width, _RANGE_PARTS + 1)
         best = float(tried[np.argmin([cost(believed, k1) for k1 in tried])])
-        width *= 2 / _STEPS
+        width *= 2 / _RANGE_PARTS
     focal = float(np.mean([each.focal for each in believed]))
     shift = abs(best) * corner**3 * focal
     if shift < _MIN_CORNER_SHIFT or cost(believed, best) > _MAX_COST_RATIO * cost(believed, 0.0):
