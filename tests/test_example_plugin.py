@@ -112,7 +112,10 @@ def test_its_own_tests_pass(kind: str, sources: Path, sites: dict[str, Path]) ->
     assert ended.returncode == 0, ended.stdout + ended.stderr
 
 
-def test_they_are_listed_and_load(installed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_they_are_listed_and_load(
+    installed: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # where a screen is narrow, packages wrap
     assert plugins(["--check"]) == 0
     text = capsys.readouterr().out
     assert "broken" not in text

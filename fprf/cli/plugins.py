@@ -88,7 +88,9 @@ def run(args: list[str]) -> int:
         else:
             state = "[green]ok[/]"
         name = f"[cyan]{escape(row.name)}[/]"
-        table.add_row(shown, name, *([state] if config.check else []), escape(row.value), escape(row.package))
+        # Of a version between releases the commit is left out: it is long, and `fprf --version` says it.
+        package = escape(row.package.partition("+")[0])
+        table.add_row(shown, name, *([state] if config.check else []), escape(row.value), package)
     console = Console()
     console.print(table)
     if not config.check:
