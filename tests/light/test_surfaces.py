@@ -71,3 +71,26 @@ def test_normals_point_out_of_a_ball_and_what_no_view_shows_counts_nothing() -> 
     assert bool((found.sure[4000:][inside] == 0).all()) and torch.equal(
         found.points[4000:][inside], means[4000:][inside]
     )
+
+
+def test_points_beside_an_outline_lie_on_one_of_its_sides() -> None:
+    """A card before a wall: no plane fits both, and what other views show without the outline counts more."""
+    draw = torch.Generator().manual_seed(2)
+    square = 2 * torch.rand(12000, 2, generator=draw) - 1
+    card = torch.cat([square[:4000] * 0.6, torch.full((4000, 1), 1.0)], 1)
+    wall = torch.cat([square[4000:] * 2.2, torch.zeros(8000, 1)], 1)
+    means = torch.cat([card, wall])
+    turns = torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+    sizes = torch.tensor([0.03, 0.03, 0.003]).log().expand(len(means), 3)
+    logits = torch.full((len(means),), 4.0)
+    cameras = []
+    for x in (-1.6, -0.8, 0.0, 0.8, 1.6):
+        world = torch.eye(4, dtype=torch.float64)
+        world[:3, :3] = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]).double()
+        world[:3, 3] = -world[:3, :3] @ torch.tensor([x, 0.0, 4.0]).double()
+        cameras.append(Pinhole(torch.tensor([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]]), world, 160, 120, 0.1))
+    found = find_surfaces(means, turns, sizes, logits, cameras, up=UP)
+    shown = found.weights > 1
+    off = (found.points - means)[:, 2].abs()
+    assert float(off[shown].quantile(0.9)) < 0.03
+    assert float(found.normals[shown][:, 2].quantile(0.1)) > 0.9
