@@ -73,6 +73,12 @@ BENCHMARKS = {
         "--steps 60 --pictures 16 --suns 1 --views 1",
         "a run of Gaussians of a town in the palette overcast; without one it trains it first",
     ),
+    "sun_traced": Benchmark(
+        "scenes of primitives captured under clouds, lit, against another renderer's paths",
+        "--scenes yard --steps 60 --views 16 --suns 1 --samples 2",
+        "the package mitsuba; half an hour",
+        ("mitsuba",),
+    ),
     "mutants": Benchmark(
         "how many small mistakes in the mathematics the tests notice",
         "--only fprf/rendering/splines.py --sample 2",

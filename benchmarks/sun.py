@@ -37,7 +37,7 @@ from fprf.training.loading import open_run
 
 from .common import report
 from .town.layout import Town, build_town
-from .town.palettes import Palette, palette
+from .town.palettes import palette
 from .town.render import View, cast, directions, geometry, is_test, render, shadowed, sun_direction, walk
 from .town.shapes import Material
 from .town.surface import FOLIAGE, SKY
@@ -74,12 +74,17 @@ class SunBenchConfig:
         at_least("views", self.views, 1)
 
 
-class _Judged(NamedTuple):
+class Judged(NamedTuple):
     """Held-out views, pixel after pixel."""
 
     cameras: Sequence[Pinhole]
     things: Annotated[Tensor, "V P"]
     """Pixels that are judged, bool."""
+
+
+class _Truth(NamedTuple):
+    """What the tracer knows of them."""
+
     solid: Annotated[Tensor, "V P"]
     """Those of things that are no foliage, bool."""
     points: Annotated[NDArray[np.float64], "V P 3"]
@@ -120,14 +125,19 @@ def _figures(config: SunBenchConfig, run: Path) -> dict[str, object]:
     found = time.perf_counter() - begun
     held_out = [k for k in range(settings.views) if is_test(k)][: config.views]
     views = [poses[k] for k in held_out]
-    judged = _judged(town, views, [covering(scene.views, k, scene.near) for k in held_out])
+    things, known_truth = _traced(town, views)
+    judged = Judged([covering(scene.views, k, scene.near) for k in held_out], things)
     rows = []
     for azimuth, elevation in _SUNS[: config.suns]:
         look = replace(palette("day"), azimuth=azimuth, elevation=elevation)
         truth = torch.stack([_pixels(render(town, view, look).rgb) for view in views])
-        rows.append(
-            {"azimuth": azimuth, "elevation": elevation} | _rows(scene, known, judged, town, look, truth)
+        sun = torch.from_numpy(sun_direction(look)).float()
+        light = Light(
+            torch.tensor(look.sun), torch.tensor(look.ambient), torch.ones(3), torch.ones(3), 1.0, elevation
         )
+        row = light_rows(scene, known, judged, light, sun, truth)
+        iou = _shadow_iou(scene, known.reach(sun), judged.cameras, known_truth, town, sun)
+        rows.append({"azimuth": azimuth, "elevation": elevation} | row | {"iou": iou})
         print("  ".join(f"{name} {value:.2f}" for name, value in rows[-1].items()), flush=True)
     return {
         "gaussians": len(scene.gaussians),
@@ -138,7 +148,8 @@ def _figures(config: SunBenchConfig, run: Path) -> dict[str, object]:
     }
 
 
-def _judged(town: Town, views: Sequence[View], cameras: Sequence[Pinhole]) -> _Judged:
+def _traced(town: Town, views: Sequence[View]) -> tuple[Annotated[Tensor, "V P"], _Truth]:
+    """Pixels that show things, and what the tracer knows of all."""
     things = []
     solid = []
     points = []
@@ -156,7 +167,7 @@ def _judged(town: Town, views: Sequence[View], cameras: Sequence[Pinhole]) -> _J
         solid.append(torch.from_numpy((label != SKY) & (label != FOLIAGE)))
         points.append(at)
         normals.append(normal)
-    return _Judged(cameras, torch.stack(things), torch.stack(solid), np.stack(points), np.stack(normals))
+    return torch.stack(things), _Truth(torch.stack(solid), np.stack(points), np.stack(normals))
 
 
 def _flat_normals(town: Town, face: NDArray[np.integer], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,14 +183,15 @@ def _pixels(picture: NDArray[np.uint8]) -> Annotated[Tensor, "P 3"]:
     return torch.from_numpy(picture).flatten(0, 1).float() / 255
 
 
-def _rows(
-    scene: SplatScene, known: Illumination, judged: _Judged, town: Town, look: Palette, truth: Tensor
+def light_rows(
+    scene: SplatScene,
+    known: Illumination,
+    judged: Judged,
+    light: Light,
+    sun: Annotated[Tensor, "3"],
+    truth: Annotated[Tensor, "V P 3"],
 ) -> dict[str, float]:
-    """PSNR of things by what is heeded of the light, and the IoU of cast shadows."""
-    sun = torch.from_numpy(sun_direction(look)).float()
-    light = Light(
-        torch.tensor(look.sun), torch.tensor(look.ambient), torch.ones(3), torch.ones(3), 1.0, look.elevation
-    )
+    """PSNR of things by what is heeded of the light, and seconds that the sun takes."""
     begun = time.perf_counter()
     reach = known.reach(sun)
     seconds = time.perf_counter() - begun
@@ -198,7 +210,6 @@ def _rows(
     found = {"plain": _psnr(shown["gain"], truth, judged.things)}
     for name, pictures in shown.items():
         found[name] = _psnr(_with_best_gain(pictures, truth, judged.things), truth, judged.things)
-    found["iou"] = _shadow_iou(scene, reach, judged, town, sun)
     found["seconds"] = seconds
     return found
 
@@ -234,15 +245,17 @@ def _with_best_gain(pictures: Tensor, truth: Tensor, where: Tensor) -> Tensor:
     return torch.stack(out, -1)
 
 
-def _shadow_iou(scene: SplatScene, reach: Tensor, judged: _Judged, town: Town, sun: Tensor) -> float:
+def _shadow_iou(
+    scene: SplatScene, reach: Tensor, cameras: Sequence[Pinhole], truth: _Truth, town: Town, sun: Tensor
+) -> float:
     """Intersection over union of the shadows that are cast on what faces the sun."""
     leafy = np.array([town.faces.material[k] == Material.FOLIAGE for k in town.first])
     both = 0
     either = 0
-    for view, camera in enumerate(judged.cameras):
-        facing = judged.normals[view] @ sun.numpy() > _MIN_FACING
-        at = np.flatnonzero(facing & judged.solid[view].numpy())
-        solid, leaves = shadowed(town, judged.points[view][at], sun.double().numpy(), leafy)
+    for view, camera in enumerate(cameras):
+        facing = truth.normals[view] @ sun.numpy() > _MIN_FACING
+        at = np.flatnonzero(facing & truth.solid[view].numpy())
+        solid, leaves = shadowed(town, truth.points[view][at], sun.double().numpy(), leafy)
         true = torch.from_numpy(solid | leaves)
         drawn = draw(scene.gaussians, camera, antialiased=scene.antialiased, features=reach[:, None])
         shown = (drawn.features[..., 0] / drawn.opacity.clamp_min(1e-4)).flatten()[torch.from_numpy(at)] < 0.5
