@@ -139,9 +139,10 @@ def _view_surface(
     deviation = (spread + inside[..., 2].square()) / _SURE_DEVIATION**2
     sure = drawn.opacity.square() / (1 + deviation).square()
     plane = torch.from_numpy(_fitted_planes(disparity.cpu().numpy(), sure.cpu().numpy())).to(means)
-    return _on_planes(
-        plane, camera, float(1 / disparity[drawn.opacity > 0.5].median().clamp_min(1e-9)), world
-    )
+    # Where nothing is opaque, all is as faint, and counts.
+    solid = drawn.opacity > drawn.opacity.max() / 2
+    usual = float(1 / disparity[solid].median().clamp_min(1e-9)) if bool(solid.any()) else 1.0
+    return _on_planes(plane, camera, usual, world)
 
 
 def _on_planes(plane: Annotated[Tensor, "H W 4"], camera: Pinhole, usual: float, world: Tensor) -> _Map:
