@@ -26,6 +26,31 @@ FRAME = (
     '<iframe src="garden.html" title="A garden to walk through, in four lights" loading="lazy" '
     'sandbox="allow-scripts" style="width: 100%; height: 32rem; border: 0"></iframe>'
 )
+PICTURES = {
+    "process": ("images/verbs/process.svg", "What it says of 26 photographs of a garden"),
+    "train": (
+        "images/verbs/train.webp",
+        "Two photographs that training did not see, and beside each the scene",
+    ),
+    "eval": ("images/verbs/eval.svg", "The garden of the demo, measured"),
+    "stylize": (
+        "images/verbs/stylize.webp",
+        "A photograph, the reference, the view in its style, and the match",
+    ),
+    "restyle": ("images/gaussians.jpg", '"Houseplant" by Marcel Padilla, CC BY 4.0; colours changed by fprf'),
+    "gallery": ("images/garden.jpg", "Views that training did not see, as trained and in four styles"),
+    "render": ("images/verbs/render.webp", "Four frames of a spiral, at night"),
+    "view": ("images/viewer-compare.jpg", "The garden as captured left of the line, in a style right of it"),
+    "export": (
+        "images/export-town.jpg",
+        "A town as drawn here, and from files that it writes, plain and in a style",
+    ),
+    "pretrain": ("images/verbs/pretrain.svg", "What it says of twelve photographs and 200 steps"),
+    "plugins": ("images/verbs/plugins.svg", "The first of what is installed"),
+    "config-schema": ("images/verbs/config-schema.svg", "The schema of a style begins so"),
+    "doctor": ("images/verbs/doctor.svg", "What it says of a folder of photographs with poses"),
+}
+"""A picture of each verb, made by it, with what it shows; `demo` has the garden itself."""
 LIVE = re.compile(r"^!\[[^\]]*\]\([^)]*garden\.webp\)$", re.MULTILINE)
 """The README's film, in the place of which the first page has the garden itself."""
 LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
@@ -113,7 +138,13 @@ def verb_page(verb: str, about: Verb) -> str:
         "```text",
         f"fprf {verb} {about.usage}",
         "```",
+        "",
     ]
+    if verb in PICTURES:
+        picture, shown = PICTURES[verb]
+        lines += [f"![{shown}](../{picture})", "", f"*{shown}*"]
+    else:
+        lines.append(FRAME.replace('src="', 'src="../'))
     word = {"pretrain": ["decoder"], "train": ["fprf-lite"]}.get(verb, [])
     lines += ["", "```text", help_of(verb, word), "```"]
     if verb == "train":

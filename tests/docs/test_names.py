@@ -118,6 +118,10 @@ def test_it_builds_without_a_warning(tmp_path: Path) -> None:
     made = subprocess.run(command, capture_output=True, text=True, check=False, env=quiet)
     assert made.returncode == 0 and "WARNING" not in made.stderr, made.stderr
     assert {path.stem for path in (tmp_path / "verbs").glob("*.html")} == set(VERBS)
+    for verb in VERBS:  # each with a picture, but the demo, which has the garden itself
+        page = (tmp_path / "verbs" / f"{verb}.html").read_text()
+        shown = re.findall(r'<(?:img|iframe)[^>]+src="([^"]+\.(?:jpg|webp|svg|html))"', page)
+        assert shown and all((tmp_path / "verbs" / each).is_file() for each in shown), verb
     for page in [tmp_path / "index.html", tmp_path / "verbs" / "export.html"]:
         text = page.read_text()
         assert not re.search(
