@@ -198,15 +198,15 @@ def _scene_rows(config: SunTracedConfig, name: str, folder: Path) -> list[dict[s
     for (azimuth, elevation), seen in zip(_SUNS[: config.suns], radiance, strict=True):
         toward = torch.from_numpy(direction_of(azimuth, elevation)).float()
         truth = torch.from_numpy(exposed(seen, things.numpy()))
-        light, _ = light_of(SunConfig(sun=known.degrees_of(toward)))
+        light = light_of(SunConfig(sun=known.degrees_of(toward)))
         row = light_rows(scene, known, judged, light, toward, truth.flatten(1, 2))
         rows.append({"scene": name, "azimuth": azimuth, "elevation": elevation} | row)
         print("  ".join(f"{key} {_short(value)}" for key, value in rows[-1].items()), flush=True)
     return rows
 
 
-def _short(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.2f}"
+def _short(value: object) -> str:
+    return f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
 def direction_of(azimuth: float, elevation: float) -> Annotated[NDArray[np.float64], "3"]:
