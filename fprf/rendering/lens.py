@@ -17,6 +17,8 @@ from torch import Tensor
 PINHOLE = 0
 OPENCV = 1  # k1 k2 k3 k4 p1 p2
 FISHEYE = 2  # k1 k2 k3 k4 of the angle
+_MIN_COEFFICIENT = 1e-80
+"""Coefficients of a lens that count: with rho^2 below 1e12, 9 k4 rho^8 of a smaller one is below 1e-31."""
 _MAX_INVERSE_ERROR = 1e-14
 """Error of the inverse in focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""
 _MAX_ITERATIONS = 60
@@ -39,6 +41,8 @@ def lens_reach(distortion: Annotated[Tensor, "V 6"], lens: Annotated[Tensor, "V"
     polynomial is monic whatever the k are, so that its companion matrix always exists.
     """
     rows, inverse = torch.unique(distortion[:, :4], dim=0, return_inverse=True)
+    # Below the least that any root within reach feels, a coefficient only keeps the eigenvalues from converging.
+    rows = torch.where(rows.abs() < _MIN_COEFFICIENT, torch.zeros(()).to(rows), rows)
     companion = torch.zeros(len(rows), 4, 4, dtype=rows.dtype, device=rows.device)
     companion[:, 0] = -rows * torch.tensor([3.0, 5.0, 7.0, 9.0], dtype=rows.dtype, device=rows.device)
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import plane_depth
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
@@ -87,6 +87,7 @@ def test_a_point_on_a_ray_projects_to_its_pixel(lenses: list[int], seed: int) ->
     st.sampled_from([OPENCV, FISHEYE]),
     st.tuples(*[st.floats(-0.25, 0.25)] * 3, st.floats(-0.05, 0.05), *[st.floats(-0.01, 0.01)] * 2),
 )
+@example(OPENCV, (0.25, 2.0e-288, 0.0, 1.1e-308, 0.0, 0.0))  # eigenvalues of so small ones do not converge
 def test_any_lens_round_trips_up_to_its_reach(lens: int, k: tuple[float, ...]) -> None:
     scene = cameras([lens], k[:4] + ((0.0, 0.0) if lens == FISHEYE else k[4:]))
     view, pixel = pixels(scene, 64)
