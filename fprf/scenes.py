@@ -140,7 +140,7 @@ class Scene(ABC):
 
     @property
     def light_notes(self) -> tuple[str, ...]:
-        """What there is to say about the light of the scene's look, a line each."""
+        """Lines that say in what light the scene was captured, for a look that changes it; none otherwise."""
         return ()
 
     @property

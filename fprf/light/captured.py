@@ -14,7 +14,8 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from .relight import GROUND_ALBEDO, LUMA, SHOULDER, Received, level_share, linear, sky_share
+from .relight import GROUND_ALBEDO, SHOULDER, Received, level_share, linear, sky_share
+from .sky import LUMA
 
 USUAL_STRENGTH = 2.0
 """s above while directions are tried: on towns 0.5 and 5 find fewer."""

@@ -23,7 +23,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from .sky import Light
+from .sky import LUMA, Light
 
 LINEAR_OFFSET = 0.055
 """Added to sRGB, it is a power of linear light."""
@@ -41,8 +41,6 @@ _METERED_GAUSSIANS = 8192
 """Gaussians that brightness is measured on, about."""
 _METER_STEPS = 20
 """Halvings of the range of exposures, 2^-8 to 2^8: to 2^-16."""
-LUMA = (0.2126, 0.7152, 0.0722)
-"""Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 
 
 class Received(NamedTuple):
@@ -104,8 +102,14 @@ def gains(
     weights: Annotated[Tensor, "N"],
 ) -> Annotated[Tensor, "N 3"]:
     """k of each Gaussian, at a brightness that keeps the mean luma; `weights` say how much of each is seen."""
-    ratio = irradiance(received, light, sun, up) / captured_irradiance(received, up)
-    return exposed_gain(ratio, colours, weights, light.brightness)
+    return exposed_gain(light_ratio(received, light, sun, up), colours, weights, light.brightness)
+
+
+def light_ratio(
+    received: Received, light: Light, sun: Annotated[Tensor, "3"], up: Annotated[Tensor, "3"]
+) -> Annotated[Tensor, "N 3"]:
+    """E / E0 above."""
+    return irradiance(received, light, sun, up) / captured_irradiance(received, up)
 
 
 def exposed_gain(
@@ -122,19 +126,18 @@ def exposed_gain(
     return gain.clamp_max(MAX_GAIN)
 
 
-def exposed(
+def exposure_of(
     received: Received,
     light: Light,
     sun: Annotated[Tensor, "3"],
     up: Annotated[Tensor, "3"],
-    before: Annotated[Tensor, "N 3"],
+    colours: Annotated[Tensor, "N 3"],
     weights: Annotated[Tensor, "N"],
-) -> tuple[Annotated[Tensor, "N 3"], float]:
-    """E / E0 above, and the exposure e: the mean luma of the linear colours `before` stays, or becomes the
-    light's share of it.
-    """
-    ratio = irradiance(received, light, sun, up) / captured_irradiance(received, up)
-    return ratio, _exposure(before, ratio, weights, light.brightness)
+) -> float:
+    """e of `gains`, above."""
+    return _exposure(
+        linear(colours.clamp(0, 1)), light_ratio(received, light, sun, up), weights, light.brightness
+    )
 
 
 def linear(colour: Tensor) -> Tensor:

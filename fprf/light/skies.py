@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..ops.rasterise.rendering import Pinhole
 from .relight import linear
+from .sky import LUMA
 
 _SURE_SHARE = 0.7
 """Of sure Gaussians in a pixel of the sure sky."""
@@ -38,8 +39,7 @@ _CHROMA_RANGE = (0.10, 0.16)
 """Sum of the differences of the shares of red, green and blue, from where all to where nothing is (by eye)."""
 MIN_SKY_HEIGHT = 0.02
 """Sine of the height above the horizon of what may be the sky (by eye)."""
-_LUMA_PARTS = np.array([0.2126, 0.7152, 0.0722], np.float32)
-"""Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
+_LUMA_PARTS = np.array(LUMA, np.float32)
 
 
 def sky_pixels(
@@ -48,12 +48,12 @@ def sky_pixels(
     camera: Pinhole,
     up: Annotated[Tensor, "3"],
 ) -> Annotated[Tensor, "H W"]:
-    """How far the pixels of a view look like the sky, in [0, 1].
+    """Likeness of the pixels of a view to the sky, in [0, 1].
 
     `image` is sRGB in [0, 1]; `sure` the share of each pixel that Gaussians show which lie where only the sky is.
     """
-    like = _likeness(linear(image).numpy(), (sure > _SURE_SHARE).numpy())
-    return torch.from_numpy(like) * (heights(camera, up) > MIN_SKY_HEIGHT)
+    like = _likeness(linear(image).cpu().numpy(), (sure > _SURE_SHARE).cpu().numpy())
+    return (torch.from_numpy(like) * (heights(camera, up) > MIN_SKY_HEIGHT).cpu()).to(image)
 
 
 def heights(camera: Pinhole, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "H W"]:
@@ -67,7 +67,7 @@ def heights(camera: Pinhole, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "H
 
 
 def _likeness(colour: NDArray[np.float32], sure: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How far each pixel of linear light looks like the sure sky around it [H W], in [0, 1]."""
+    """Likeness of each pixel of linear light to the sure sky around it [H W], in [0, 1]."""
     none = np.zeros(sure.shape, np.float32)
     if sure.mean() < _MIN_VIEW_SHARE:
         return none

@@ -130,12 +130,12 @@ _USUAL_ELEVATIONS = {
     "moonlight": 40.0,
 }
 """Degrees of the sun of each light above the horizon, where no sun is given."""
-_LUMA = torch.tensor([0.2126, 0.7152, 0.0722])
+LUMA = (0.2126, 0.7152, 0.0722)
 """Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 
 
 def _luma(colour: Annotated[Tensor, "3"]) -> float:
-    return float(colour @ _LUMA)
+    return float(colour @ torch.tensor(LUMA))
 
 
 def _white(colour: Annotated[Tensor, "3"]) -> Annotated[Tensor, "3"]:

@@ -38,9 +38,9 @@ _SCRIPTS = (
     "sun.js",
     "stage.js",
 )
-"""What every page runs, in this order."""
+"""Scripts of every page, in the order in which they run."""
 PAGE_SCRIPTS = ("page.js",)
-"""What the file that one sends runs besides."""
+"""Scripts of the file that one sends, besides."""
 
 
 def read_asset(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Who may connect to the viewer and by which address: names, tokens, and a middleware that refuses others.
+"""Access to the viewer: addresses, names, tokens, and a middleware that refuses others.
 
 By default this machine alone may connect; from elsewhere a token is needed. A page of another site that is
 open in the same browser can send requests here, so Host must name this machine (DNS rebinding) and Origin

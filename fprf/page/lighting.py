@@ -50,7 +50,7 @@ class Lighting:
         hours: list[dict[str, Any]] = []
         for hour in day(_SHOWN_SUNS, illumination.azimuth):
             hours.append({"hour": hour.hour, "at": [hour.azimuth, hour.elevation]})
-        head = {**surfaces_header(illumination, self._scene.gaussians), "day": hours}
+        head = {**surfaces_header(illumination), "day": hours}
         planes = packed_surfaces(illumination)[:, self._order.numpy()]
         return container(head, {"planes": zlib.compress(planes.tobytes(), 1)})
 
@@ -60,7 +60,7 @@ class Lighting:
         """
         illumination = self.find()
         reach = self._draft_reach if moving and self._every > 1 else None
-        found = packed_light(illumination, self._scene.gaussians, config, reach)
+        found = packed_light(illumination, config, reach)
         parts = {}
         if found.met is not None:
             parts["met"] = zlib.compress(found.met[self._order.numpy()].tobytes(), 1)

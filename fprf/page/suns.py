@@ -26,13 +26,11 @@ from ..light.relight import (
     MAX_GAIN,
     SHOULDER,
     bounced,
-    exposed,
+    exposure_of,
     level_share,
-    linear,
     sky_share,
     sun_share,
 )
-from ..splats.gaussians import Gaussians
 from ..splats.relighting import MAX_SKY_GAIN, MIN_SKY_COLOUR, Illumination, Reach
 
 
@@ -79,11 +77,11 @@ def packed_surfaces(illumination: Illumination) -> Annotated[NDArray[np.uint8], 
     return _bytes(torch.stack([level, opened]))
 
 
-def surfaces_header(illumination: Illumination, gaussians: Gaussians) -> dict[str, Any]:
+def surfaces_header(illumination: Illumination) -> dict[str, Any]:
     """Data of surfaces for the page, whatever the light."""
     fit = None
     if bool(illumination.sky.any()):
-        fit = illumination.captured_sky(gaussians).fit.tolist()
+        fit = illumination.captured_sky.fit.tolist()
     return {
         "ahead": illumination.ahead.tolist(),
         "fit": fit,
@@ -95,19 +93,15 @@ def surfaces_header(illumination: Illumination, gaussians: Gaussians) -> dict[st
     }
 
 
-def packed_light(
-    illumination: Illumination, gaussians: Gaussians, config: SunConfig, reach: Reach | None = None
-) -> PackedLight:
+def packed_light(illumination: Illumination, config: SunConfig, reach: Reach | None = None) -> PackedLight:
     """A light as the page draws it; `reach` takes the place of `illumination.reach`. Its strength is left to the
     page.
     """
     light, sun, received = illumination.under(config, reach)
-    weights = torch.where(illumination.sky, torch.zeros(()), illumination.surfaces.weights)
-    before = linear(gaussians.colours.clamp(0, 1))
-    _, exposure = exposed(received, light, sun, illumination.up, before, weights)
+    exposure = exposure_of(received, light, sun, illumination.up, illumination.colours, illumination.metered)
     level = 1.0
     if bool(illumination.sky.any()):
-        level = illumination.captured_sky(gaussians).level(light)
+        level = illumination.captured_sky.level(light)
     head: dict[str, Any] = {
         "sun": (exposure * light.sun).tolist(),
         "sky": (exposure * light.sky).tolist(),
@@ -122,16 +116,16 @@ def packed_light(
     return PackedLight(met, head)
 
 
-def packed_day(illumination: Illumination, gaussians: Gaussians, suns: int) -> Suns:
+def packed_day(illumination: Illumination, suns: int) -> Suns:
     """A day with so many suns; at noon most of what the views show is lit."""
     lights = []
     for hour in day(suns, illumination.azimuth):
-        light = packed_light(illumination, gaussians, hour.config)
+        light = packed_light(illumination, hour.config)
         place = {"hour": hour.hour, "at": [hour.azimuth, hour.elevation], "met": light.met is not None}
         lights.append(PackedLight(light.met, {**light.head, **place}))
-    overcast = packed_light(illumination, gaussians, SunConfig(light="overcast"))
+    overcast = packed_light(illumination, SunConfig(light="overcast"))
     surfaces = packed_surfaces(illumination)
-    return Suns(surfaces, surfaces_header(illumination, gaussians), tuple(lights), overcast)
+    return Suns(surfaces, surfaces_header(illumination), tuple(lights), overcast)
 
 
 def _bytes(share: Tensor) -> NDArray[np.uint8]:

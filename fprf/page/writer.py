@@ -174,7 +174,7 @@ def page_html(
     kept = None
     suns = None
     if page.suns:
-        suns = packed_day(scene.light_found, scene.gaussians, page.suns)
+        suns = packed_day(scene.light_found, page.suns)
     for _ in range(_MAX_FITTING_ROUNDS):
         _, head, parts = packed_scene(scene, harmonics, page.start, kept, suns=suns)
         text = _text(page, head, parts)

@@ -77,7 +77,7 @@ _TRIED_ELEVATION = 20.0
 _TRIED_GAUSSIANS = 8192
 """Gaussians that they are tried on, about."""
 _MIN_LIKENESS = 0.6
-"""How far pixels of a Gaussian look like the sky where it is the sky, at least (by eye)."""
+"""Likeness to the sky of the pixels of a Gaussian of the sky, at least (by eye)."""
 MIN_SKY_COLOUR = 0.02
 """Linear light that a captured sky has at least."""
 MAX_SKY_GAIN = 4.0
@@ -86,12 +86,12 @@ MAX_SKY_GAIN = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Illumination:
-    """What light needs to know of N Gaussians, whatever its direction."""
+    """Surfaces, shadows and sky of N Gaussians, for light from any direction."""
 
     surfaces: Surfaces
     blockers: Blockers
     spread: Annotated[Tensor, "N"]
-    """How thick the surface is: distance from it of what is seen with it."""
+    """Thickness of the surface: mean distance from it of what is seen with it."""
     openness: Annotated[Tensor, "N"]
     far: Annotated[Tensor, "N"]
     """Gaussians that neither cast shadows nor lie in them, bool."""
@@ -236,7 +236,7 @@ class Illumination:
 
     @property
     def received(self) -> Received:
-        """What all Gaussians receive, but for the sun."""
+        """Light on all Gaussians, but for that of the sun."""
         none = torch.zeros(len(self.far))
         return Received(self.surfaces.normals, self.surfaces.sure, self.openness, none)
 
@@ -258,34 +258,34 @@ class Illumination:
             received = received._replace(reach=(reach or self.reach)(sun, config.sun_size))
         return light, sun, received
 
-    def gain(self, gaussians: Gaussians, config: SunConfig) -> Annotated[Tensor, "N 3"]:
+    def gain(self, config: SunConfig) -> Annotated[Tensor, "N 3"]:
         """Factors of colours + 0.055 in a light."""
-        gain = torch.ones(len(gaussians), 3)
+        gain = torch.ones_like(self.colours)
         if config.unlit:
             gain = self.unlit_gain
         if config.light is not None or config.sun is not None:
             light, sun, received = self.under(config)
-            colours = gain * (gaussians.colours + LINEAR_OFFSET) - LINEAR_OFFSET
+            colours = gain * (self.colours + LINEAR_OFFSET) - LINEAR_OFFSET
             gain = gain * gains(received, light, sun, self.up, colours, self.metered)
             if bool(self.sky.any()):
-                gain[self.sky] = self.sky_gain(gaussians, light)
+                gain[self.sky] = self.sky_gain(light)
         return 1 + config.sun_strength * (gain - 1)
 
-    def sky_gain(self, gaussians: Gaussians, light: Light) -> Annotated[Tensor, "S 3"]:
+    def sky_gain(self, light: Light) -> Annotated[Tensor, "S 3"]:
         """Factors of colours + 0.055 that give the captured sky, in the mean at each height, the light's own
         colours.
         """
         height = self.heights[self.sky].clamp(0, 1)[:, None]
-        captured = self.captured_sky(gaussians)
-        mean = captured.mean_at(height)
+        mean = self.captured_sky.mean_at(height)
         wanted = torch.lerp(light.horizon, light.zenith, height.sqrt())
-        gain: Tensor = (captured.level(light) * wanted / mean).clamp_max(MAX_SKY_GAIN).pow(1 / 2.4)
+        gain: Tensor = (self.captured_sky.level(light) * wanted / mean).clamp_max(MAX_SKY_GAIN).pow(1 / 2.4)
         return gain
 
-    def captured_sky(self, gaussians: Gaussians) -> "CapturedSky":
+    @cached_property
+    def captured_sky(self) -> "CapturedSky":
         """Colours of the captured sky by height."""
         height = self.heights[self.sky].clamp(0, 1)
-        linear = (gaussians.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
+        linear = (self.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
         weight = (self.surfaces.weights[self.sky] + 1e-6)[:, None]
         rows = torch.stack([torch.ones_like(height), height], 1)
         fit = torch.linalg.lstsq((rows * weight.sqrt()).double(), (linear * weight.sqrt()).double()).solution
@@ -322,7 +322,7 @@ _CLEAR_SKY_SHARE = 0.75
 
 
 def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int) -> Illumination:
-    """What is known of some rows, of every so many neighbours one, as much larger where they cast shadows."""
+    """The illumination of some rows alone, one of `every` neighbours, each as much larger where it casts shadows."""
     kept = illumination
     # Rows of the blockers, which are those that are not far.
     place = (~kept.far).cumsum(0) - 1
@@ -389,7 +389,7 @@ def _seen_again(
     up: Annotated[Tensor, "3"],
     antialiased: bool,
 ) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
-    """How far the pixels that show a Gaussian look like the sky, in [0, 1], and how thick the surface is there:
+    """Likeness to the sky of the pixels that show a Gaussian, in [0, 1], and the thickness of the surface there:
     the mean distance of what they show from it.
     """
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
@@ -430,12 +430,12 @@ def world_axes(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], Annotated[Tens
 
 
 def mixed_gain(
-    illumination: Illumination, gaussians: Gaussians, parts: Sequence[tuple[float, SunConfig | None]]
+    illumination: Illumination, parts: Sequence[tuple[float, SunConfig | None]]
 ) -> Annotated[Tensor, "N 3"]:
     """The gain of lights that are mixed by shares; None is the captured one."""
-    total = torch.zeros(len(gaussians), 3)
+    total = torch.zeros_like(illumination.colours)
     for share, config in parts:
-        total += share * (1.0 if config is None else illumination.gain(gaussians, config))
+        total += share * (1.0 if config is None else illumination.gain(config))
     return total
 
 

@@ -154,7 +154,7 @@ class SplatScene(Scene):
     def light_gain(self) -> Annotated[Tensor, "N 3"]:
         """Factors of colours + 0.055 in the light of the scene's look."""
         assert self.look is not None  # by `styled_harmonics`
-        return mixed_gain(self.light_found, self.gaussians, self.look.lights)
+        return mixed_gain(self.light_found, self.look.lights)
 
     @property
     def light_found(self) -> Illumination:
@@ -165,7 +165,7 @@ class SplatScene(Scene):
 
     @property
     def light_notes(self) -> tuple[str, ...]:
-        """What light the capture was taken in."""
+        """A line about the light of the capture, for a look that changes it."""
         look = self.look
         if look is None or not look.lit:
             return ()

@@ -70,7 +70,7 @@ class Measured(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What pairs of colours at one place say about points described by X numbers."""
+    """Coefficients that pairs of colours at one place give to points described by X numbers."""
 
     gains: Annotated[Tensor, "X 3"]
     """Coefficients of logarithms of gains: W, V and b."""

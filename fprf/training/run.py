@@ -126,7 +126,7 @@ class Known:
 
 
 def _not_a_run(path: Path) -> str:
-    """What a path without config.json is, and what takes or makes it."""
+    """The message for a path without config.json: its kind, and the command that takes or makes it."""
     if path.is_file() and format_name(path) is not None:
         return (
             f"{path}: a capture of Gaussians, and no run folder; `fprf restyle {path} --references PHOTO.jpg "

@@ -39,14 +39,14 @@ def test_a_sun_draws_what_the_rasteriser_draws(browser: Any, tmp_path: Path, kin
     scene = seen({"ball": ball(3000, 1), "street": street(2000)}[kind])
     scene = inside(scene) if kind == "street" else scene
     known = scene.light_found
-    day = packed_day(known, scene.gaussians, SUNS)
+    day = packed_day(known, SUNS)
     page = opened(browser, written(tmp_path / "page.html", scene, suns=SUNS))
     order = pack(scene.gaussians).order
     for light in (day.day[2], day.day[-1]):
         hour = light.head["hour"]
         found = torch.tensor(page.evaluate(GAINS, hour)).view(-1, 4)[:, :3]
         config = next(each.config for each in hours_of(SUNS, known.azimuth) if each.hour == hour)
-        gain = known.gain(scene.gaussians, config)
+        gain = known.gain(config)
         assert float((found - gain[order]).abs().mean()) < 0.02
         lit = rasterised(scene, 2, relit_harmonics(scene.gaussians.harmonics, gain))
         assert psnr(drawn(page, scene, 2, {"first": "Captured", "blend": 0}), lit) > 36

@@ -42,7 +42,7 @@ def test_a_sun_is_a_part_of_the_look(splats: Session, listener: Listener) -> Non
     listener.until(lambda: bool(heard(listener, "colours Now")))
     assert splats.state.described()["sun"] == {"light": None, "sun": (120.0, 20.0), "strength": 0.8}
     head, parts = unpacked(splats.lights.light("Now"))
-    light = packed_light(scene.light_found, scene.gaussians, CONFIG)  # type: ignore[attr-defined]
+    light = packed_light(scene.light_found, CONFIG)  # type: ignore[attr-defined]
     order = splats.packed.order.numpy()
     assert light.met is not None and parts["met"] == light.met[order].tobytes()
     assert head["strength"] == 0.8 and head["sun"] == light.head["sun"]
@@ -54,7 +54,7 @@ def test_a_sun_is_a_part_of_the_look(splats: Session, listener: Listener) -> Non
     assert "light Now" in dict(splats.hello())
     # What is shown is what is saved; the scene as captured stays as it was.
     saved = read_capture(splats.gaussians("Now", "Captured", 1.0, ".ply")).gaussians.harmonics
-    gain = scene.light_found.gain(scene.gaussians, CONFIG)  # type: ignore[attr-defined]
+    gain = scene.light_found.gain(CONFIG)  # type: ignore[attr-defined]
     assert torch.allclose(saved, relit_harmonics(scene.gaussians.harmonics, gain), atol=1e-5)  # type: ignore[attr-defined]
     plain = read_capture(splats.gaussians("Captured", "Captured", 1.0, ".ply")).gaussians.harmonics
     assert torch.equal(plain, scene.gaussians.harmonics)  # type: ignore[attr-defined]

@@ -40,7 +40,7 @@ def test_bytes_are_within_half_a_step_of_what_they_stand_for(scene: SplatScene) 
     facing = level_share(received, known.up).numpy()
     assert (np.abs(level - facing)[thing] <= HALF_STEP + 1e-6).all()
     assert (np.abs(level - known.heights.numpy())[~thing] <= HALF_STEP + 1e-6).all()
-    met = packed_light(known, scene.gaussians, NOON).met
+    met = packed_light(known, NOON).met
     assert met is not None
     assert (np.abs(met / 255 - sun_share(received, sun).numpy()) <= HALF_STEP + 1e-6).all()
 
@@ -48,7 +48,7 @@ def test_bytes_are_within_half_a_step_of_what_they_stand_for(scene: SplatScene) 
 def gain_of(scene: SplatScene, terms: dict[str, list[float]], level: NDArray[np.float64],
             opened: NDArray[np.float64], met: NDArray[np.float64]) -> torch.Tensor:  # fmt: skip
     """Gains of things by the formula of `web/sun.js`."""
-    head = surfaces_header(scene.light_found, scene.gaussians)
+    head = surfaces_header(scene.light_found)
     u, o, m = (torch.from_numpy(each)[:, None] for each in (level, opened, met))
     sun, sky, bounce = (torch.tensor(terms[name]) for name in ("sun", "sky", "bounce"))
     ratio = (m * sun / o + u * sky + (1 - u) * bounce) / (u + (1 - u) * head["albedo"])
@@ -65,7 +65,7 @@ def test_gains_by_bytes_are_as_far_from_exact_ones_as_half_a_step_of_each_takes_
 ) -> None:
     known = scene.light_found
     level, opened = packed_surfaces(known) / 255
-    light = packed_light(known, scene.gaussians, config)
+    light = packed_light(known, config)
     met = np.zeros(len(level)) if light.met is None else light.met / 255
     # The gain is monotone in each byte: what half a step up or down makes of it bounds the exact one.
     corners = []
@@ -74,7 +74,7 @@ def test_gains_by_bytes_are_as_far_from_exact_ones_as_half_a_step_of_each_takes_
         for share, sign in zip((level, opened, met), signs, strict=True):
             shares.append(np.clip(share + sign * HALF_STEP, 0, 1))
         corners.append(gain_of(scene, light.head, *shares))
-    exact = known.gain(scene.gaussians, config)
+    exact = known.gain(config)
     thing = ~known.sky
     low = torch.stack(corners).amin(0)[thing]
     high = torch.stack(corners).amax(0)[thing]
@@ -103,7 +103,7 @@ def test_a_day_has_no_such_number_of_suns(count: int) -> None:
 
 def test_a_page_holds_a_byte_a_sun_of_the_gaussians_that_it_shows(tmp_path: Path) -> None:
     scene = seen(ball(3000))
-    suns = packed_day(scene.light_found, scene.gaussians, 8)
+    suns = packed_day(scene.light_found, 8)
     some = torch.tensor([5, 3, 2999])
     held = np.frombuffer(zlib.decompress(suns.section(some)), np.uint8).reshape(10, 3)
     assert (held[:2] == suns.surfaces[:, some.numpy()]).all()

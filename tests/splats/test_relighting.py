@@ -236,7 +236,7 @@ def test_small_and_faint_captures_are_lit_without_a_fault(count: int, logit: flo
         made, False, RandomConfig().build(), LookConfig(views=3, size=(48, 36), regions=1)
     )
     for name in ("noon", "overcast"):
-        gain = illuminated(small).gain(small.gaussians, SunConfig(light=name))
+        gain = illuminated(small).gain(SunConfig(light=name))
         assert bool(gain.isfinite().all()) and float(gain.min()) > 0
 
 
