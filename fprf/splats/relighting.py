@@ -54,6 +54,8 @@ _SOUGHT_ELEVATIONS = (30.0, 45.0, 60.0)
 """Degrees above the horizon. Lower ones explain much of towns under clouds, too: what faces them is brighter."""
 _MIN_SOUGHT_ELEVATION = 25.0
 """Degrees above the horizon down to which it is sought."""
+_SOUGHT_BLOCKERS = 30_000
+"""Gaussians that cast shadows in the search, at most: of more, some stand for all."""
 _SOUGHT_STEPS = (7.5, 7.5, 3.75)
 """Degrees about the best of these that are tried then."""
 _MIN_EXPLAINED = 0.05
@@ -171,6 +173,12 @@ class Illumination:
     @cached_property
     def captured_sun(self) -> CapturedSun | None:
         """The sun of the capture; None under clouds and in the shade."""
+        every = math.ceil(len(self.far) / _SOUGHT_BLOCKERS)
+        if every == 1:
+            return self._sought_sun()
+        return thinned(self, torch.arange(0, len(self.far), every), every)._sought_sun()
+
+    def _sought_sun(self) -> CapturedSun | None:
         shown = torch.where(self.far, torch.zeros(()), self.surfaces.weights).nonzero()[:, 0]
         if len(shown) < _MIN_TRIED_GAUSSIANS:
             return None
