@@ -73,6 +73,10 @@ BENCHMARKS = {
         "--steps 60 --pictures 16 --suns 1 --views 1",
         "a run of Gaussians of a town in the palette overcast; without one it trains it first",
     ),
+    "captured_sun": Benchmark(
+        "the sun that towns were captured in, found from Gaussians of their tracer",
+        "--towns 1 --clouded 1",
+    ),
     "sun_traced": Benchmark(
         "scenes of primitives captured under clouds, lit, against another renderer's paths",
         "--scenes yard --steps 60 --views 16 --suns 1 --samples 2",

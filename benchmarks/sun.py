@@ -38,7 +38,18 @@ from fprf.training.loading import open_run
 from .common import report
 from .town.layout import Town, build_town
 from .town.palettes import palette
-from .town.render import View, cast, directions, geometry, is_test, render, shadowed, sun_direction, walk
+from .town.render import (
+    View,
+    cast,
+    directions,
+    geometry,
+    is_test,
+    normals_at,
+    render,
+    shadowed,
+    sun_direction,
+    walk,
+)
 from .town.shapes import Material
 from .town.surface import FOLIAGE, SKY
 from .town.truth import town_settings
@@ -161,22 +172,13 @@ def _traced(town: Town, views: Sequence[View]) -> tuple[Annotated[Tensor, "V P"]
         there = np.where(np.isfinite(hits.distance.ravel()), hits.distance.ravel(), 0.0)
         at = view.pose[:, 3] + there[:, None] * np.stack(ray, -1).reshape(-1, 3)
         normal = np.zeros((len(face), 3), np.float32)
-        normal[face >= 0] = _flat_normals(town, face[face >= 0], at[face >= 0])
+        normal[face >= 0] = normals_at(town, face[face >= 0], at[face >= 0])
         label = geometry(town, view)[1].ravel()
         things.append(torch.from_numpy(label != SKY))
         solid.append(torch.from_numpy((label != SKY) & (label != FOLIAGE)))
         points.append(at)
         normals.append(normal)
     return torch.stack(things), _Truth(torch.stack(solid), np.stack(points), np.stack(normals))
-
-
-def _flat_normals(town: Town, face: NDArray[np.integer], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normals of faces, round ones at their points."""
-    faces = town.faces
-    round_ = (points - faces.centre[face]) * faces.curve[face]
-    length = np.linalg.norm(round_, axis=1, keepdims=True)
-    flat = np.cross(faces.u, faces.v)[face]
-    return np.asarray(np.where(length > 0, round_ / np.maximum(length, 1e-12), flat))
 
 
 def _pixels(picture: NDArray[np.uint8]) -> Annotated[Tensor, "P 3"]:

@@ -277,7 +277,8 @@ def _encode(light: NDArray[np.floating]) -> Colours:
     return np.asarray(np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055), np.float32)
 
 
-def _normals(town: Town, face: NDArray[np.integer], points: Array) -> Colours:
+def normals_at(town: Town, face: NDArray[np.integer], points: Array) -> Colours:
+    """Normals [N 3] of faces [N], round ones at their points [N 3]."""
     faces = town.faces
     flat = np.cross(faces.u, faces.v)
     round_ = (points - faces.centre[face]) * faces.curve[face]
@@ -319,7 +320,7 @@ def _lamplight(town: Town, points: Array, normals: Colours, look: Palette) -> Co
 def shade(town: Town, look: Palette, face: NDArray[np.integer], points: Array) -> Colours:
     """sRGB colours [N 3] in [0, 1] of surface points [N 3] on faces [N] (>= 0)."""
     sun = sun_direction(look)
-    normals = _normals(town, face, points)
+    normals = normals_at(town, face, points)
     kinds = town.faces.material[face]
     leafy = np.flatnonzero(kinds == Material.FOLIAGE)
     distant = town.faces.style[face[leafy]] == 1
