@@ -13,7 +13,7 @@
  *   photographs: HTMLInputElement, keep: HTMLFormElement, gentle: HTMLButtonElement, map: HTMLSelectElement,
  *   play: HTMLButtonElement, seconds: HTMLInputElement, format: HTMLSelectElement, scale: HTMLSelectElement,
  *   files: HTMLInputElement, folder: HTMLInputElement, minutes: HTMLInputElement, path: HTMLFormElement,
- *   stop: HTMLButtonElement,
+ *   stop: HTMLButtonElement, hour: HTMLInputElement, shine: HTMLInputElement,
  *   'keep-name': HTMLInputElement, 'style-file': HTMLInputElement, 'film-side': HTMLSelectElement,
  *   'film-fps': HTMLSelectElement, 'make-film': HTMLButtonElement, 'path-of': HTMLInputElement,
  * }} Elements

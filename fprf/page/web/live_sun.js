@@ -1,4 +1,3 @@
-// @ts-nocheck until its types are told
 // The light of a scene of a server: it finds what the sun reaches, and this page what colours that makes (sun.js).
 
 const ON_THE_WAY = 4; // degrees from the day's way within which a sun has a time
@@ -8,15 +7,17 @@ class LiveSun {
   /** @param {Live} live */
   constructor(live) {
     this.live = live;
-    /** @type {?SunPanel} once what it needs has come */
+    /** @type {SunPanel?} once the surfaces have come */
     this.panel = null;
     /** @type {?Promise<LitSurfaces>} of a step of the scene's training */
     this.surfaces = null;
+    /** @type {number?} */
     this.step = null;
-    // While the sun is dragged the panel goes ahead of the server, and so does what is wanted.
+    // While the sun is dragged the panel goes ahead of the server.
     this.moving = false;
+    /** @type {SunState?} the light that was asked for and has not come */
     this.wanted = null;
-    // Where the slider of the time was last.
+    /** @type {number?} where the slider of the time was last */
     this.hour = null;
     // When the last wish was sent, and how long its light took to be shown.
     this.asked = 0;
@@ -26,7 +27,7 @@ class LiveSun {
 
   /** Fetch what all lights need, once for each step of a training. */
   load() {
-    const { step } = this.live.scene;
+    const step = this.live.scene?.step ?? null;
     if (this.step !== step || !this.surfaces) {
       this.step = step;
       this.surfaces = this.fetched().catch((error) => { this.surfaces = null; throw error; });
@@ -36,7 +37,8 @@ class LiveSun {
 
   async fetched() {
     const { head, parts } = await unpacked(await asked("/surfaces"));
-    const planes = await inflate(parts.planes), count = planes.length / 2;
+    const planes = await inflate(parts.planes);
+    const count = planes.length / 2;
     if (!this.panel) {
       this.panel = new SunPanel(this.live.place, { ahead: head.ahead, day: head.day, along: false }, {
         move: (sun, moving) => this.wish({ light: this.named === "moonlight" ? "moonlight" : null, sun }, moving),
@@ -44,7 +46,7 @@ class LiveSun {
         strengthen: (strength, moving) => this.wish({ strength }, moving),
         name: (name) => this.wish({ light: name === "captured" ? null : name, sun: null }, false),
       });
-      this.fill(this.live.state.sun);
+      this.fill(this.light);
     }
     return { level: planes.subarray(0, count), open: planes.subarray(count), head };
   }
@@ -54,19 +56,28 @@ class LiveSun {
     this.load().catch((error) => say(error.message, true));
   }
 
-  get named() { return this.live.state.sun.light; }
+  /** The light of the state. @returns {SunState} */
+  get light() {
+    return this.live.state?.sun ?? { light: null, sun: null, strength: 1 };
+  }
 
+  get named() {
+    return this.light.light;
+  }
+
+  /** @param {number} hour @param {boolean} moving */
   time(hour, moving) {
+    if (!this.panel) return;
     this.hour = hour;
-    const sun = sunAt(this.panel.day, hour).map((x) => Math.round(10 * x) / 10);
+    const sun = tenths(sunAt(this.panel.day, hour));
     if (sun[1] >= LEAST_ELEVATION) this.wish({ light: null, sun }, moving);
     else this.wish({ light: "blue-hour", sun: null }, moving);
   }
 
-  /** Tell the server what light somebody wants. */
+  /** Ask the server for a light. @param {Partial<SunState>} changes @param {boolean} moving */
   wish(changes, moving) {
     this.moving = moving;
-    this.wanted = { ...this.live.state.sun, ...this.wanted, ...changes };
+    this.wanted = { ...this.light, ...this.wanted, ...changes };
     const { light, sun, strength } = this.wanted;
     this.show(this.wanted);
     const send = () => {
@@ -80,40 +91,49 @@ class LiveSun {
     }
   }
 
-  /** Show the light of a state, unless somebody is changing it. */
+  /** Show the light of a state, unless somebody is changing it. @param {SunState} light */
   fill(light) {
     if (this.moving) return;
     this.wanted = null;
     if (this.panel) this.show(light);
   }
 
+  /**
+   * @param {SunState} wanted
+   * @param {SunPlace?} place of the sun of a light that does not say where
+   */
   show({ light, sun, strength }, place = null) {
-    const shown = sun ?? place, { day } = this.panel;
-    let hour = light === "blue-hour" ? this.dusk : null;
+    if (!this.panel) return;
+    const { day } = this.panel;
+    let hour = light === "blue-hour" ? this.dusk(day) : null;
     if (sun) {
       const near = hourAt(day, sun);
       if (dot(directionOf(sunAt(day, near)), directionOf(sun)) > Math.cos(ON_THE_WAY * Math.PI / 180)) hour = near;
     }
-    this.panel.show({ name: light ?? (sun ? "" : "captured"), at: shown, hour, strength });
+    this.panel.show({ name: light ?? (sun ? "" : "captured"), at: sun ?? place, hour, strength });
   }
 
-  /** The time of a blue hour: that of the slider, if it was moved to one of the two, else the evening. */
-  get dusk() {
-    const { day } = this.panel;
-    return this.hour !== null && sunAt(day, this.hour)[1] < LEAST_ELEVATION ? this.hour : day.at(-1).hour;
+  /** The time of a blue hour: that of the slider, if it was moved to one of the two, else the evening. @param {DayTime[]} day */
+  dusk(day) {
+    return this.hour !== null && sunAt(day, this.hour)[1] < LEAST_ELEVATION ? this.hour : timeOf(day, -1).hour;
   }
 
-  /** Fetch the light of a look and show it; without a version it has none. */
+  /**
+   * Fetch the light of a look and show it; without a version it has none.
+   * @param {{name: string, version: number?}} message
+   */
   async relight({ name, version }) {
-    const { live } = this, { splats } = live.place;
+    const { live } = this;
+    const { splats } = live.place;
     if (live.remote) live.remote.stale = true;
     if (splats && version === null) splats.light([name], null);
     if (splats && version !== null) {
       const surfaces = await this.load();
       const { head, parts } = await unpacked(await asked(`/light?name=${encodeURIComponent(name)}&version=${version}`));
       const part = { terms: head, met: parts.met ? await inflate(parts.met) : null, share: 1 };
-      splats.light([name], gainsOf(surfaces, [part], splats.colours.get("Captured"), head.strength));
-      if (name === "Now" && this.panel && !this.moving) this.show(live.state.sun, head.at);
+      const captured = splats.colours.get("Captured");
+      if (captured) splats.light([name], gainsOf(surfaces, [part], captured, head.strength));
+      if (name === "Now" && !this.moving) this.show(this.light, head.at);
       this.milliseconds = performance.now() - this.asked;
     }
     live.place.touch(false);
