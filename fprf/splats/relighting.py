@@ -367,7 +367,8 @@ def find_illumination(
     eyes = cameras.pose[:, :, 3].float().mean(0)
     heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ up
     sky = far & (heights > MIN_SKY_HEIGHT)
-    shares, spread = _seen_again(gaussians, surfaces, far, sky, pinholes, up, antialiased)
+    # Half of the views tell as much: on the town all of them are 0.02 dB worse, and take 0.6 s more for a plant.
+    shares, spread = _seen_again(gaussians, surfaces, far, sky, pinholes[::2], up, antialiased)
     sky = sky | ((shares > _MIN_LIKENESS) & (heights > MIN_SKY_HEIGHT))
     far = far | sky
     covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
