@@ -59,7 +59,7 @@ _SOUGHT_BLOCKERS = 30_000
 _SOUGHT_STEPS = (7.5, 7.5, 3.75)
 """Degrees about the best of these that are tried then."""
 _MIN_EXPLAINED = 0.05
-"""Share of the variance of light that a captured sun explains, at least: towns under clouds stay below (`captured_sun.json`)."""
+"""Share of the variance of light that a captured sun explains, at least: cloudy towns stay below (`captured_sun.json`)."""
 _MIN_TRIED_GAUSSIANS = 500
 """Gaussians that tell a captured sun."""
 _LIFT_SHARE = 0.4
