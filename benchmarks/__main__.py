@@ -89,6 +89,11 @@ BENCHMARKS = {
         "the extra test; hours for all modules; Linux",
         ("pytest", "hypothesis"),
     ),
+    "minutes": Benchmark(
+        "Gaussians of captures against minutes of training",
+        "{town} --minutes 0.05",
+        "captures; two free cores, as all budgets are wall time",
+    ),
     "page": Benchmark(
         "the page: pictures against the rasteriser, frames, sorting, memory, and a dropped photograph",
         "--parts million --few",

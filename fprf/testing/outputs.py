@@ -1,7 +1,7 @@
 """Requirements that say in one sentence what was found where, as AssertionError, and the checks of the
 program's own.
 
-Contracts (`testing.contracts`) are made of them. The first outputs of plug-ins are checked while a model or a
+Contracts (`testing.styling` and its neighbours) are made of them. The first outputs of plug-ins are checked while a model or a
 style is built: a breach is told with the plug-in's name, as PluginError, not met later as a strange image. A
 handful of points cost milliseconds, and nothing afterwards.
 """
