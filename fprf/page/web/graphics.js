@@ -134,6 +134,7 @@ const programsOf = (gl) => ({
   project: linkProgram(gl, VERTEX, NOTHING, ["place", "look"]),
   splat: linkProgram(gl, QUAD, FRAGMENT),
   cover: linkProgram(gl, FULL, COVER),
+  fade: linkProgram(gl, FULL, FADE),
   around: linkProgram(gl, FULL, AROUND),
   show: linkProgram(gl, FULL, SHOW),
 });

@@ -14,6 +14,8 @@ const AROUND_SIZE = [24, 16]; // pixels of what lies around a picture: it is as 
 const AROUND_ASKED = [20, 12]; // places of a picture that each of them is a mean of
 const AROUND_WIDTH = 0.11; // of the picture, over which that mean fades: about half of a wing; by eye
 const AROUND_PRIOR = 0.005; // weight of the page's own colour, of one place: where nothing is near; by eye
+const FADE_SIDE = 3; // places on each side of one, that say how much about it was seen
+const FADE_APART = 0.02; // of the picture's width, from one to the next; by eye: over twice that it fades
 const BORDER_SHARE = 0.12; // of a frame's side, within which it counts less; by eye
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
@@ -142,6 +144,17 @@ void main() {
     if (f.z > 0.) sum += within.x * within.y * exp(-apart * apart);
   }
   o = vec4(smoothstep(${UNSEEN_SHARE}, 1., sum / needed));
+}`;
+// Fade towards what was not seen, within what was: single seen things in the unseen fade too.
+const FADE = `${COMMON}
+uniform sampler2D cover; out vec4 o;
+void main() {
+  vec2 whole = vec2(textureSize(cover, 0)), sum = vec2(0.);
+  for (int i = -${FADE_SIDE}; i <= ${FADE_SIDE}; i++) for (int j = -${FADE_SIDE}; j <= ${FADE_SIDE}; j++) {
+    vec2 there = (gl_FragCoord.xy + ${FADE_APART} * whole.x * vec2(i, j)) / whole;
+    sum += exp(-.4 * float(i * i + j * j)) * vec2(texture(cover, there).r, 1.);
+  }
+  o = vec4(min(texture(cover, gl_FragCoord.xy / whole).r, smoothstep(.5, 1., sum.x / sum.y)));
 }`;
 // What lies around a picture: colours of what is drawn near, carried on to where nothing is.
 const AROUND = `${COMMON}

@@ -310,7 +310,7 @@ class Splats {
 
   /**
    * Begin a pass over a whole picture.
-   * @param {"show"|"cover"|"around"} name of its program
+   * @param {"show"|"cover"|"fade"|"around"} name of its program
    * @param {Object<string, WebGLTexture>} textures
    * @param {{buffer: WebGLFramebuffer?, x?: number, y?: number, width: number, height: number}} into
    */
@@ -353,7 +353,10 @@ class Splats {
     gl.uniform1f(places.around, near.around);
     gl.uniform1f(places.needed, Math.min(SEEN_BY, near.count));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    return found;
+    const faded = this.frame(width, height, "faded");
+    this.pass("fade", { cover: found.picture }, faded);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    return faded;
   }
 
   /**
