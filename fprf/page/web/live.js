@@ -264,7 +264,7 @@ class Live {
     }
     stage.sending.read();
     // Where others may connect, their address, and its code.
-    fetch("/address").then(async (answer) => { if (answer.ok) stage.sending.share(await answer.text()); }, () => {});
+    fetch("/address").then(async (answer) => { if (answer.status === 200) stage.sending.share(await answer.text()); }, () => {});
     if (this.state) this.panel.fill(this.state);
     Object.assign(window, { fprf: { place, stage, live: this } });
   }

@@ -14,9 +14,10 @@ const AROUND_SIZE = [24, 16]; // pixels of what lies around a picture: it is as 
 const AROUND_ASKED = [20, 12]; // places of a picture that each of them is a mean of
 const AROUND_WIDTH = 0.11; // of the picture, over which that mean fades: about half of a wing; by eye
 const AROUND_PRIOR = 0.005; // weight of the page's own colour, of one place: where nothing is near; by eye
-const FADE_SIDE = 3; // places on each side of one, that say how much about it was seen
-const FADE_APART = 0.02; // of the picture's width, from one to the next; by eye: over twice that it fades
-const BORDER_SHARE = 0.12; // of a frame's side, within which it counts less; by eye
+const FADE_SIDE = 9; // places on each side of one, that say how much about it was seen
+const FADE_APART = 0.018; // of the picture's shorter side, from one to the next; by eye
+const LEAST_ABOUT = 0.67; // share of it, up to which nothing is shown: more than on a straight rim, so that what stands across it goes; by eye
+const BORDER_SHARE = 0.07; // of a frame's side, within which it counts less; by eye
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 `;
@@ -145,16 +146,19 @@ void main() {
   }
   o = vec4(smoothstep(${UNSEEN_SHARE}, 1., sum / needed));
 }`;
-// Fade towards what was not seen, within what was: single seen things in the unseen fade too.
+// Fade towards what was not seen, within what was; single seen things in the unseen fade too. Once across, once down.
 const FADE = `${COMMON}
-uniform sampler2D cover; out vec4 o;
+uniform sampler2D cover; uniform bool down; out vec4 o;
 void main() {
-  vec2 whole = vec2(textureSize(cover, 0)), sum = vec2(0.);
-  for (int i = -${FADE_SIDE}; i <= ${FADE_SIDE}; i++) for (int j = -${FADE_SIDE}; j <= ${FADE_SIDE}; j++) {
-    vec2 there = (gl_FragCoord.xy + ${FADE_APART} * whole.x * vec2(i, j)) / whole;
-    sum += exp(-.4 * float(i * i + j * j)) * vec2(texture(cover, there).r, 1.);
+  vec2 whole = vec2(textureSize(cover, 0)), sum = vec2(0.), here = gl_FragCoord.xy;
+  vec2 apart = ${FADE_APART} * min(whole.x, whole.y) * (down ? vec2(0., 1.) : vec2(1., 0.));
+  for (int i = -${FADE_SIDE}; i <= ${FADE_SIDE}; i++) {
+    float near = exp(-.5 * pow(2. * float(i) / ${FADE_SIDE}., 2.));
+    vec2 there = (here + float(i) * apart) / whole;
+    if (clamp(there, 0., 1.) == there) sum += near * vec2(texture(cover, there).r, 1.); // of what lies outside nothing is known
   }
-  o = vec4(min(texture(cover, gl_FragCoord.xy / whole).r, smoothstep(.5, 1., sum.x / sum.y)));
+  float about = sum.x / sum.y, own = texture(cover, here / whole).g;
+  o = down ? vec4(min(own, smoothstep(${LEAST_ABOUT}, 1., about))) : vec4(about, own, 0., 0.);
 }`;
 // What lies around a picture: colours of what is drawn near, carried on to where nothing is.
 const AROUND = `${COMMON}

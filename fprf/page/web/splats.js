@@ -353,10 +353,19 @@ class Splats {
     gl.uniform1f(places.around, near.around);
     gl.uniform1f(places.needed, Math.min(SEEN_BY, near.count));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    const faded = this.frame(width, height, "faded");
-    this.pass("fade", { cover: found.picture }, faded);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-    return faded;
+    return this.fade(found);
+  }
+
+  /** Let what was seen fade towards what was not. @param {Target} found */
+  fade(found) {
+    const { gl } = this;
+    const across = this.frame(found.width, found.height, "across");
+    for (const [from, to] of [[found, across], [across, found]]) {
+      const { places } = this.pass("fade", { cover: from.picture }, to);
+      gl.uniform1i(places.down, to === found ? 1 : 0);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    return found;
   }
 
   /**

@@ -196,7 +196,7 @@ class Stage {
     at("mix").setAttribute("aria-valuetext", wiping ? `line at ${share} %` : `${share} % ${to}`);
     at("mix").disabled = from === to;
     at("from").value = from;
-    at("towards").textContent = called(to);
+    at("towards").textContent = from === to ? "" : called(to);
     at("much").textContent = from === to ? "" : `${share} %`;
     this.root.classList.toggle("alone", this.styles.length < 2);
     at("blending").hidden = this.styles.length < 2 && !this.root.classList.contains("field");
