@@ -374,7 +374,9 @@ class ViewerServer:
 
     async def _address(self, request: Request) -> Response:
         if is_loopback(self.access.host):
-            return Response(status_code=204)  # every page asks, and browsers write refusals into their console
+            return Response(
+                status_code=204
+            )  # every page asks, and browsers write refusals into their console
         return Response(self._shared(), media_type="text/plain")
 
     async def _code(self, request: Request) -> Response:
