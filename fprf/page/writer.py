@@ -54,6 +54,8 @@ _PHOTOGRAPHS_FILL = 0.75
 """Filling of a stage of another format, from 0 (all of a photograph is seen) to 1 (nothing beyond it is);
 by eye. Views of captures show whole objects.
 """
+_BEYOND_FOUND = 0.3
+"""Share of a frame beyond each of its sides that views found about an object count as having seen; by eye."""
 _REACH_RATIO = 1.6
 """Distance that one may go from the middle of the cameras, relative to the farthest of them; by eye."""
 _REACH_DEPTHS = 0.5
@@ -252,13 +254,21 @@ def packed_scene(
         progress(_PACKING_SHARE + (1 - _PACKING_SHARE) * next(looked) / depths)
         return _depth(scene, view)
 
-    place = about(scene.views, start, depth)
+    # Views that were found about an object hold just it, so that its tips lie at their rim.
+    found_about = scene.poses is None and _look_inwards(scene.views)
+    place = about(scene.views, start, depth, _BEYOND_FOUND if found_about else 0.0)
     return packed, {**header(packed), **drawing, **place, "styles": styles}, parts
 
 
-def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[str, Any]:
+def _look_inwards(cameras: Cameras) -> bool:
+    """Whether cameras stand about what they look at, and not within it."""
+    place = cameras.pose[:, :, 3]
+    return float(((place.mean(0) - place) * -cameras.pose[:, :, 2]).sum(1).mean()) > 0
+
+
+def about(cameras: Cameras, start: int, depth: Callable[[int], float], beyond: float = 0.0) -> dict[str, Any]:
     """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera
-    turns about.
+    turns about. Cameras count as having seen `beyond` of their frame on each side of it, too.
     """
     # Evenly chosen cameras in their order, rotated so that the one to start from comes first.
     others = _evenly(len(cameras), _MAX_PAGE_CAMERAS)
@@ -279,7 +289,7 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float]) -> dict[s
         "up": up.tolist(),
         "reach": {"centre": centre.tolist(), "radius": radius},
         "cameras": [_camera(cameras, view, far) for view, far in zip(chosen, depths, strict=True)],
-        "seen": [_frame(cameras, view) for view in _evenly(len(cameras), _MAX_SEEN_CAMERAS)],
+        "seen": [_frame(cameras, view, beyond) for view in _evenly(len(cameras), _MAX_SEEN_CAMERAS)],
     }
 
 
@@ -288,13 +298,14 @@ def _evenly(count: int, most: int) -> list[int]:
     return torch.linspace(0, count - 1, min(most, count)).round().long().tolist()
 
 
-def _frame(cameras: Cameras, view: int) -> list[float]:
+def _frame(cameras: Cameras, view: int, beyond: float) -> list[float]:
     """Rows of a matrix [3 4] from a point of the world to (u z, v z, z), where u and v are in [0, 1] in the
-    frame, and the camera's place.
+    frame, which is larger by a share `beyond` on each side, and the camera's place.
     """
     camera = covering(cameras, view, 0.0)
     scaled = camera.intrinsics.double()
     scaled[:2] /= torch.tensor([[camera.width], [camera.height]])
+    scaled[:2] = (scaled[:2] + beyond * scaled[2]) / (1 + 2 * beyond)
     rows = scaled @ camera.world_to_camera[:3].double()
     return [float(f"{x:.6g}") for x in [*rows.flatten().tolist(), *cameras.pose[view, :, 3].tolist()]]
 

@@ -19,9 +19,10 @@ from splat_ball import ball
 
 from fprf.errors import DataError, UsageError
 from fprf.page.pack import CHUNK, fit_maps, pack
-from fprf.page.writer import PageView, Style, page_html, write_page
+from fprf.page.writer import PageView, Style, packed_scene, page_html, write_page
 from fprf.splats.files.base import three_to_four
 from fprf.splats.gaussians import HARMONIC, Gaussians
+from fprf.splats.pinholes import camera_of
 
 VOID = {"meta", "link", "img", "input", "br"}
 EVIL = """<script>alert(1)</script>"'&<b>${x}$title"""
@@ -227,6 +228,21 @@ def test_chats_find_a_title_and_a_picture_where_the_page_has_an_address(tmp_path
     assert cv2.imread(str(tmp_path / "ball.jpg")).shape[2] == 3
     assert "og:image" not in written(tmp_path / "plain.html", seen(ball(50))).read_text()
     assert not (tmp_path / "plain.jpg").exists()
+
+
+def test_views_found_about_an_object_have_seen_beyond_their_frames(tmp_path: Path) -> None:
+    scene = seen(ball(200))
+    camera = camera_of(scene.views, 0)
+    corner = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
+    point = camera.world_to_camera[:3, :3].T.double() @ (
+        3 * torch.linalg.inv(camera.intrinsics.double()) @ corner
+    )
+    point = torch.cat([point[:, 0] + scene.views.pose[0, :, 3].double(), torch.ones(1)])
+    for photographed, share in ((False, 0.3 / 1.6), (True, 0.0)):
+        known = replace(scene, poses=lambda captured, views: torch.zeros(0)) if photographed else scene
+        frame = torch.tensor(packed_scene(known, [scene.gaussians.harmonics], 0)[1]["seen"][0]).double()
+        u, v, depth = frame[:12].view(3, 4) @ point
+        assert u / depth == pytest.approx(share, abs=1e-3) and v / depth == pytest.approx(share, abs=1e-3)
 
 
 def test_a_page_says_how_many_of_the_gaussians_it_holds(tmp_path: Path) -> None:
