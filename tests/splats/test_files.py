@@ -21,7 +21,7 @@ from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.drawing import draw
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.base import format_of, spatial_order
-from fprf.splats.files.sog import bundle, unbundle
+from fprf.splats.files.sog_archive import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.pinholes import camera_of
 

@@ -19,7 +19,7 @@ from fprf.errors import DataError
 from fprf.ops.harmonics import spherical_harmonics
 from fprf.rendering.splines import rotations
 from fprf.splats.files import read_capture, write_capture, write_gaussians
-from fprf.splats.files.sog import unbundle
+from fprf.splats.files.sog_archive import unbundle
 from fprf.splats.gaussians import Gaussians
 
 

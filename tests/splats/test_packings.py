@@ -25,7 +25,8 @@ from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.drawing import draw
 from fprf.splats.files import Capture, read_capture, write_capture, write_gaussians
-from fprf.splats.files.sog import _picture, _webp, bundle, unbundle
+from fprf.splats.files.sog_archive import bundle, unbundle
+from fprf.splats.files.sog_images import lossless_webp, picture_of_rows
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.pinholes import camera_of
 
@@ -429,7 +430,7 @@ def test_short_codebooks_and_models_of_sog(tmp_path: Path) -> None:
 
     book = np.unique(plain.gaussians.log_scales.numpy())
     index = np.searchsorted(book, plain.gaussians.log_scales.numpy())
-    parts["scales.webp"] = _webp(_picture(index, (13, 16)))
+    parts["scales.webp"] = lossless_webp(picture_of_rows(index, (13, 16)))
     short = {"files": ["scales.webp"], "codebook": book.astype(float).tolist()}
     assert torch.equal(read(scales=short).gaussians.log_scales, plain.gaussians.log_scales) and used < 16
     with pytest.raises(DataError):

@@ -18,7 +18,8 @@ import numpy as np
 from ...errors import DataError
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
-from .sog import Sog, bundle
+from .sog import Sog
+from .sog_archive import bundle
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,14 +13,11 @@ Recoloured, a file keeps its labels: each entry of the palette becomes the mean 
 
 import io
 import json
-import re
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,14 +31,20 @@ from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
+from .sog_archive import bundle, folder_files, folder_of, image_names, read_meta, unbundle
+from .sog_images import (
+    CODEBOOK_NUMBERS,
+    ENTRIES_PER_ROW,
+    MAX_PALETTE_ENTRIES,
+    ByteImage,
+    label_means,
+    lossless_webp,
+    palette_labels,
+    palette_picture,
+    picture_of_rows,
+    quantized,
+)
 
-_Bytes: TypeAlias = NDArray[np.uint8]
-_CODEBOOK_NUMBERS = 256
-"""Numbers of a codebook: what a byte tells apart."""
-_ENTRIES_PER_ROW = 64
-"""Entries of the palette a row."""
-_MAX_PALETTE_ENTRIES = 1 << 16
-"""Entries of a palette at most: what a label of 16 bits tells apart."""
 _MAX_PIXELS_PER_BYTE = 8
 """Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is
 decoded.
@@ -50,12 +53,6 @@ _SLACK_PIXELS = 1 << 16
 """Pixels or Gaussians that any image may have, whatever its bytes: small ones shrink more."""
 _MAX_STEP_OF_SOG = 2.0**-12
 """Steps of positions in extents of the capture, to which outliers do not matter."""
-_MAX_MEMBERS = 64
-"""Files of an archive or names in a meta.json, at most; SOG has 8."""
-_IMAGE_NAME = re.compile(r"\w[\w .-]*\.(webp|png)", re.IGNORECASE)
-"""Names of images in a folder: no other file can be read or replaced by what a meta.json says."""
-_CODEBOOK_STEPS = 12
-"""Steps of Lloyd's algorithm: further ones change no byte that is seen (by eye)."""
 _POSITION_STEPS = 65535
 """Of positions between their bounds: 16 bits."""
 _MAX_LN_POSITION = 80.0
@@ -64,8 +61,6 @@ _LN_SIZES_OF_SOG = (-20.0, 20.0)
 """ln-scales that are written: what lies beyond would spoil the codebook of the others."""
 _TURN_TAG = 252
 """Added to the number of the component of a rotation that is left out, in its alpha."""
-_ARCHIVE_TIME = (1980, 1, 1, 0, 0, 0)
-"""Time of archived files: the same capture gives the same bytes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +75,7 @@ class Sog(CaptureFormat):
         if data[:2] == b"PK":
             data = bytes(data)
         else:
-            data = bundle(_folder(path, bytes(data)))
+            data = bundle(folder_files(path, bytes(data)))
         files = unbundle(path, data)
         folder = folder_of(path, files)
         parts = {}
@@ -124,14 +119,14 @@ class Sog(CaptureFormat):
         turn = np.concatenate([base.steps(three / 2 + 0.5, 255), largest[:, None] + _TURN_TAG], 1)
         opacity = base.steps(base.sigmoid(logits), 255)
         ln_sizes = log_scales.clip(*_LN_SIZES_OF_SOG)
-        scale, scales = _quantized(ln_sizes, {"files": ["scales.webp"], "codebook": []})
-        tint, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
+        scale, scales = quantized(ln_sizes, {"files": ["scales.webp"], "codebook": []})
+        tint, sh0 = quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
         pictures = {
-            "means_l.webp": _picture(at & 255, shape),
-            "means_u.webp": _picture(at >> 8, shape),
-            "quats.webp": _picture(turn, shape),
-            "scales.webp": _picture(scale, shape),
-            "sh0.webp": _picture(np.concatenate([tint, opacity[:, None]], 1), shape),
+            "means_l.webp": picture_of_rows(at & 255, shape),
+            "means_u.webp": picture_of_rows(at >> 8, shape),
+            "quats.webp": picture_of_rows(turn, shape),
+            "scales.webp": picture_of_rows(scale, shape),
+            "sh0.webp": picture_of_rows(np.concatenate([tint, opacity[:, None]], 1), shape),
         }
         bounds = {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]}
         meta: dict[str, Any] = {"version": 2, "count": count}
@@ -143,7 +138,7 @@ class Sog(CaptureFormat):
             pictures |= palette
         parts = {}
         for name, picture in pictures.items():
-            parts[name] = _webp(picture)
+            parts[name] = lossless_webp(picture)
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
@@ -155,7 +150,7 @@ class Sog(CaptureFormat):
             return
         files = unbundle(path, b"".join(pieces))
         folder = folder_of(path, files)
-        names = dict.fromkeys(("meta.json", *_images(path, _json(path, files[f"{folder}meta.json"]))))
+        names = dict.fromkeys(("meta.json", *image_names(path, read_meta(path, files[f"{folder}meta.json"]))))
         with ExitStack() as stack:
             # Files take their names from the last to the first.
             for name in names:
@@ -171,7 +166,7 @@ class _Rows:
 
     def __init__(self, path: Path, parts: Mapping[str, bytes]) -> None:
         self.parts = parts
-        meta = _json(path, parts["meta.json"])
+        meta = read_meta(path, parts["meta.json"])
         # Version 1 has no such entry.
         version = meta.get("version", 1)
         if version not in (1, 2):
@@ -222,102 +217,41 @@ class _Rows:
         new = {}
         said = json.loads(self.parts["meta.json"])
         name = said["sh0"]["files"][0]
-        index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
+        index, said["sh0"] = quantized(harmonics[:, 0], said["sh0"])
         picture = self.pictures.picture(name)
         picture.reshape(-1, 4)[: self.count, :3] = index
-        new[name] = _webp(picture)
+        new[name] = lossless_webp(picture)
         if len(self.rest):
             # Labels stay: an entry of the palette becomes the mean of what its Gaussians became.
             entries = len(self.rest)
-            mixed = _means(harmonics[:, 1:].reshape(self.count, -1), self.labels, entries)
+            mixed = label_means(harmonics[:, 1:].reshape(self.count, -1), self.labels, entries)
             seen = np.bincount(self.labels, minlength=entries) > 0
             palette = np.where(seen[:, None, None], mixed.reshape(self.rest.shape), self.rest)
             name = said["shN"]["files"][0]
-            index, said["shN"] = _quantized(palette, said["shN"])
-            new[name] = _webp(_palette_picture(index))
+            index, said["shN"] = quantized(palette, said["shN"])
+            new[name] = lossless_webp(palette_picture(index))
         new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
         return new
 
 
 def _packed_palette(
     harmonics: Floats, degree: int, shape: tuple[int, int]
-) -> tuple[dict[str, _Bytes], dict[str, Any]]:
+) -> tuple[dict[str, ByteImage], dict[str, Any]]:
     """The images of all harmonics but the constants, and what meta.json says of them: whole rows share a
     palette, whose entries share a codebook.
     """
     rows = harmonics[:, 1:].reshape(len(harmonics), -1)
-    labels = _labels(rows)
+    labels = palette_labels(rows)
     used = int(labels.max()) + 1
-    entries = _means(rows, labels, used).reshape(used, -1, 3)
+    entries = label_means(rows, labels, used).reshape(used, -1, 3)
     files = ["shN_centroids.webp", "shN_labels.webp"]
-    index, said = _quantized(entries, {"count": used, "bands": degree, "codebook": [], "files": files})
+    index, said = quantized(entries, {"count": used, "bands": degree, "codebook": [], "files": files})
     bytes_of_labels = np.stack([labels & 255, labels >> 8, 0 * labels], 1)
-    return {files[0]: _palette_picture(index), files[1]: _picture(bytes_of_labels, shape)}, said
+    return {files[0]: palette_picture(index), files[1]: picture_of_rows(bytes_of_labels, shape)}, said
 
 
 def _bent(means: Floats) -> Floats:
     return np.sign(means) * np.log1p(np.abs(means))
-
-
-def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
-    """The files of an archive, in their order. Raises DataError where it is damaged, or claims more than it
-    holds.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            entries = archive.infolist()
-            # WebP does not shrink: what claims more than the archive is long is damaged, but for texts.
-            if len(entries) > _MAX_MEMBERS or sum(entry.file_size for entry in entries) > 2 * len(data) + (
-                1 << 22
-            ):
-                raise DataError(
-                    f"{path}: {len(entries)} files that claim more than the archive holds; copy it again"
-                )
-            found: dict[str, bytes] = {}
-            for entry in entries:
-                found[entry.filename] = archive.read(entry)
-            return found
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        RuntimeError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
-        raise DataError(
-            f"{path}: no readable .sog archive ({error}); copy it again, it is cut off or damaged"
-        ) from error
-
-
-def folder_of(path: Path, files: Mapping[str, bytes]) -> str:
-    """The folder of an archive, with its slash, that holds the meta.json nearest to the top. Raises DataError
-    without one.
-    """
-    found = []
-    for name in files:
-        if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/"):
-            found.append(name)
-    if not found:
-        raise DataError(f"{path}: an archive without meta.json; not a SOG file")
-    return min(found, key=lambda name: (name.count("/"), name)).removesuffix("meta.json")
-
-
-def bundle(parts: Mapping[str, bytes], like: bytes | None = None) -> bytes:
-    """Files as an archive, stored as they are; times are those of the archive `like`, where it has such a
-    file.
-    """
-    times: dict[str, tuple[int, int, int, int, int, int]] = {}
-    if like is not None:
-        with zipfile.ZipFile(io.BytesIO(like)) as archive:
-            for entry in archive.infolist():
-                times[entry.filename] = entry.date_time
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
-        for name, content in parts.items():
-            archive.writestr(zipfile.ZipInfo(name, times.get(name, _ARCHIVE_TIME)), content)
-    return out.getvalue()
 
 
 class _Pictures:
@@ -361,7 +295,7 @@ class _Pictures:
             raise self._wrong(f"{group}.{name} is no list of {many} numbers")
         return values
 
-    def picture(self, name: str, most: int | None = None) -> _Bytes:
+    def picture(self, name: str, most: int | None = None) -> ByteImage:
         """An image [H W 4], RGBA, of at most so many pixels."""
         if most is None:
             most = 2 * self.count + _SLACK_PIXELS
@@ -385,7 +319,7 @@ class _Pictures:
             return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGBA), np.uint8)
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), np.uint8)
 
-    def rows(self, group: str, which: int) -> _Bytes:
+    def rows(self, group: str, which: int) -> ByteImage:
         """The pixels [N 4] of an image, one a Gaussian."""
         name = self._name(group, which)
         pixels = self.picture(name).reshape(-1, 4)
@@ -403,7 +337,7 @@ class _Pictures:
 
     def book(self, group: str, index: NDArray[np.integer[Any]]) -> Floats:
         """A codebook: of as many numbers, at least, as indices use."""
-        return self.numbers(group, "codebook", _CODEBOOK_NUMBERS, int(index.max(initial=0)) + 1)
+        return self.numbers(group, "codebook", CODEBOOK_NUMBERS, int(index.max(initial=0)) + 1)
 
     def palette(self) -> tuple[NDArray[np.int64], Floats]:
         """The label of each Gaussian, and the harmonics that labels mean [entries K-1 3]; no entries where it
@@ -413,12 +347,12 @@ class _Pictures:
         if about is None:
             return np.zeros(self.count, np.int64), np.zeros((0, 0, 3))
         name = self._name("shN", 0)
-        picture = self.picture(name, _MAX_PALETTE_ENTRIES * max(COUNTS))
-        coefficients = picture.shape[1] // _ENTRIES_PER_ROW
-        entries = picture.shape[0] * _ENTRIES_PER_ROW
-        if picture.shape[1] % _ENTRIES_PER_ROW or coefficients + 1 not in COUNTS or coefficients == 0:
+        picture = self.picture(name, MAX_PALETTE_ENTRIES * max(COUNTS))
+        coefficients = picture.shape[1] // ENTRIES_PER_ROW
+        entries = picture.shape[0] * ENTRIES_PER_ROW
+        if picture.shape[1] % ENTRIES_PER_ROW or coefficients + 1 not in COUNTS or coefficients == 0:
             raise self._wrong(
-                f"{name} is {picture.shape[1]} pixels wide; {_ENTRIES_PER_ROW} entries of 3, 8 or 15 harmonics are a row"
+                f"{name} is {picture.shape[1]} pixels wide; {ENTRIES_PER_ROW} entries of 3, 8 or 15 harmonics are a row"
             )
         index = picture[..., :3].reshape(entries, coefficients, 3)
         if "codebook" in about:
@@ -447,132 +381,3 @@ class _Pictures:
 
     def _wrong(self, what: str) -> DataError:
         return DataError(f"{self.path}: {what}; not a SOG file, or it is damaged")
-
-
-def _folder(path: Path, data: bytes) -> dict[str, bytes]:
-    """The images that a meta.json names, from its own folder alone, and itself."""
-    parts: dict[str, bytes] = {}
-    for name in _images(path, _json(path, data)):
-        try:
-            parts[name] = (path.parent / name).read_bytes()
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
-    if path.name == "meta.json":
-        return {**parts, path.name: data}
-    return {**parts, "meta.json": data}
-
-
-def _images(path: Path, meta: Mapping[str, Any]) -> list[str]:
-    """Names of the images of a meta.json. Raises DataError for one that may be any other file's."""
-    names = []
-    for group in meta.values():
-        if isinstance(group, dict) and isinstance(group.get("files"), list):
-            names += group["files"]
-    for name in names:
-        if not isinstance(name, str) or not _IMAGE_NAME.fullmatch(name) or len(names) > _MAX_MEMBERS:
-            raise DataError(f"{path}: {name!r} is no .webp or .png beside it; not a SOG folder")
-    return names
-
-
-def _json(path: Path, data: bytes) -> dict[str, Any]:
-    try:
-        meta = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no valid meta.json ({error}); not a SOG file, or it is damaged") from error
-    if not isinstance(meta, dict) or not isinstance(meta.get("means"), dict):
-        raise DataError(f"{path}: a meta.json without `means`; not a SOG file")
-    return meta
-
-
-def _webp(picture: _Bytes) -> bytes:
-    """Lossless, colours of transparent pixels among it where OpenCV can."""
-    options = [cv2.IMWRITE_WEBP_QUALITY, 101]
-    mode = getattr(cv2, "IMWRITE_WEBP_LOSSLESS_MODE", None)
-    if mode is not None:
-        options = [mode, cv2.IMWRITE_WEBP_LOSSLESS_PRESERVE_COLOR]
-    done, data = cv2.imencode(".webp", cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA), options)
-    assert done
-    return bytes(data.tobytes())
-
-
-def _picture(rows: NDArray[np.integer[Any]], shape: tuple[int, int]) -> _Bytes:
-    """Rows [N C] as RGBA pixels, opaque where C = 3."""
-    pixels = np.full((shape[0] * shape[1], 4), 255, np.uint8)
-    pixels[: len(rows), : rows.shape[1]] = rows
-    return pixels.reshape(*shape, 4)
-
-
-def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
-    """Entries [E K-1 3] in rows of 64."""
-    entries, coefficients, _ = index.shape
-    return _picture(index.reshape(-1, 3), (-(-entries // _ENTRIES_PER_ROW), _ENTRIES_PER_ROW * coefficients))
-
-
-def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
-    """Values [... 3] as bytes, and what meta.json says of them: a new codebook, or new ranges (version 1)."""
-    said = dict(about)
-    values = base.finite(values)
-    if "codebook" in said:
-        book = _codebook(values.ravel())
-        said["codebook"] = book.tolist()
-        return np.searchsorted((book[1:] + book[:-1]) / 2, values), said
-    whole = isinstance(said["mins"], (int, float))
-    if whole:
-        axes = tuple(range(values.ndim))
-    else:
-        axes = tuple(range(values.ndim - 1))
-    low = values.min(axes)
-    high = values.max(axes)
-    index = base.steps(base.shares(values, low, high), 255)
-    if whole:
-        return index, said | {"mins": float(low), "maxs": float(high)}
-    return index, said | {
-        "mins": [*low.tolist(), *said["mins"][3:]],
-        "maxs": [*high.tolist(), *said["maxs"][3:]],
-    }
-
-
-def _codebook(values: Floats) -> Floats:
-    """256 increasing numbers near to all values (Lloyd's algorithm on a line), float32 in float64."""
-    # Sums of sorted values give the mean of any stretch of them at once.
-    ordered = np.sort(values)
-    total = np.concatenate([[0.0], np.cumsum(ordered)])
-    ranks = np.rint(np.linspace(0, len(ordered) - 1, _CODEBOOK_NUMBERS)).astype(np.int64)
-    # Half by rank and half by distance: rare far values are not left out. Gaps cost no more than one number.
-    widest = float(np.ptp(np.percentile(ordered, (10, 90)))) / _CODEBOOK_NUMBERS
-    along = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(ordered), widest or np.inf))])
-    book = (ordered[ranks] + np.interp(np.linspace(0, along[-1], _CODEBOOK_NUMBERS), along, ordered)) / 2
-    for _ in range(_CODEBOOK_STEPS):
-        edges = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
-        inside = np.diff(edges)
-        book = np.where(inside > 0, np.diff(total[edges]) / np.maximum(inside, 1), book)
-    return np.maximum.accumulate(book.astype(np.float32)).astype(np.float64)
-
-
-def _labels(rows: Floats) -> NDArray[np.int64]:
-    """At most 65536 groups of like rows [N C]: each its own where there are no more, else halves of halves.
-
-    A group is cut at the median of the column that varies most in it.
-    """
-    if len(rows) <= _MAX_PALETTE_ENTRIES:
-        return np.arange(len(rows))
-    labels = np.zeros(len(rows), np.int64)
-    for level in range(16):
-        groups = 1 << level
-        # The variance of each column within each group.
-        spread = _means(rows**2, labels, groups) - _means(rows, labels, groups) ** 2
-        order = np.lexsort((rows[np.arange(len(rows)), spread.argmax(1)[labels]], labels))
-        starts = np.searchsorted(labels[order], np.arange(groups))
-        sizes = np.diff([*starts, len(rows)])
-        rank = np.arange(len(rows)) - starts[labels[order]]
-        labels[order] = 2 * labels[order] + (2 * rank >= sizes[labels[order]])
-    return np.unique(labels, return_inverse=True)[1]
-
-
-def _means(rows: Floats, labels: NDArray[np.int64], count: int) -> Floats:
-    """Mean row of each label; 0 where there is none."""
-    inside = np.maximum(np.bincount(labels, minlength=count), 1)
-    parts = []
-    for column in rows.T:
-        parts.append(np.bincount(labels, column, count))
-    return np.stack(parts, 1) / inside[:, None]
