@@ -3,14 +3,13 @@ benchmarks tables`.
 """
 
 import math
-import re
 from typing import Any
 
 SCENES = {
     "fox": "#e8710a",
-    "llff_flower, poses by fprf process": "#1a73e8",
+    "llff_flower": "#1a73e8",
     "city_ochota": "#188038",
-    "llff_fern, poses by fprf process": "#a142f4",
+    "llff_fern": "#a142f4",
     "garden_seattle": "#d93025",
 }
 """Scenes that are drawn, and the colours of their lines."""
@@ -20,7 +19,7 @@ PANELS = (
     ("lpips", "LPIPS, lower is better", 0.05, 0.30, 0.05),
 )
 """Key of the results, title, ends and steps of the axis."""
-MINUTES = (1, 3, 10, 30)
+MINUTES = (0.5, 1, 3, 5)
 WIDTH = 300
 HEIGHT = 230
 MARGIN = 34
@@ -31,9 +30,7 @@ GAP = 26
 
 def points(found: Any, scene: str, key: str) -> list[tuple[float, float]]:
     """Minutes and values of the runs of a scene, by minutes."""
-    rows = [row for row in found.values() if row["scene"] == scene]
-    timed = [(re.search(r"--minutes ([\d.]+)", row["command"]), row[key]) for row in rows]
-    return sorted((float(minutes[1]), value) for minutes, value in timed if minutes is not None)
+    return sorted((row["minutes"], row[key]) for row in found.values() if row["scene"] == scene)
 
 
 def drawing(found: Any) -> str:

@@ -17,32 +17,35 @@ from typing import Any
 from fprf.errors import UsageError
 from fprf.io.atomic import write_json
 
-from .curves import drawing
+from .curves import SCENES, drawing
 from .evidence import DERIVED, OF, ROOT, document, link, pages, read_result, result_files, stale
 
 CURVES = ROOT / "docs" / "images" / "minutes.svg"
 PLACE = re.compile(r"(<!-- table: (\w+)(?: of (\w+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 """`NAME`, or `NAME of RESULT` where they differ."""
 Rows = Iterable[Iterable[str]]
+_SHORT = 5.0
+"""Minutes up to which `minutes` has the captures of the drawing."""
 
 
 def splat_training(found: Any) -> Rows:
-    """Training of Gaussians in the fewest, the most, and five minutes: what was planned, and how near it
-    comes.
+    """Training of Gaussians with other poses, of other captures, and for longer than `minutes`: what was planned,
+    and how near it comes.
     """
     yield "capture", "size", "minutes", "steps", "Gaussians", "PSNR", "SSIM", "LPIPS", "memory"
-    minutes = {
+    given = {
         name: float(re.findall(r"--minutes ([\d.]+)|$", row["command"])[0] or 0)
         for name, row in found.items()
     }
     for name, row in found.items():
-        beside = [minutes[other] for other in found if found[other]["scene"] == row["scene"]]
-        if minutes[name] not in (min(beside), 5.0, max(beside)):
+        longest = max(given[other] for other in found if found[other]["scene"] == row["scene"])
+        shown = given[name] == longest or (given[name] == _SHORT and "own-poses" in name)
+        if not shown or (row["scene"] in SCENES and given[name] <= _SHORT):
             continue
         yield (
             row["scene"],
             row["size"],
-            f"{minutes[name]:g}" if minutes[name] else "",
+            f"{given[name]:g}" if given[name] else "",
             str(row["steps"]),
             str(row["gaussians"]),
             f"{row['psnr']:.2f} dB",
@@ -74,18 +77,23 @@ def methods(found: Any) -> Rows:
         yield scene, str(row["training_views"]), "x".join(map(str, row["size"])), *told
 
 
-def one_minute(found: Any) -> Rows:
-    """Captures after one minute, before and now."""
-    yield "capture", "size", "steps", "PSNR", "SSIM", "LPIPS"
-    for scene, now in found["scenes"].items():
-        before = now["before"]
+def minutes(found: Any) -> Rows:
+    """Captures against minutes of training."""
+    yield "capture", "size", "minutes", "steps", "Gaussians", "PSNR", "SSIM", "LPIPS", "memory"
+    for row in found.values():
+        psnr = f"{row['psnr']:.2f} dB"
+        if "psnr_fitted_poses" in row:
+            psnr += f" ({row['psnr_fitted_poses']:.2f} dB)"
         yield (
-            scene,
-            now["size"],
-            f"{before['steps']} to {now['steps']}",
-            f"{before['psnr']:.2f} dB to {now['psnr']:.2f} dB",
-            f"{before['ssim']:.3f} to {now['ssim']:.3f}",
-            f"{before['lpips']:.3f} to {now['lpips']:.3f}",
+            row["scene"],
+            row["size"],
+            f"{row['minutes']:g}",
+            str(row["train_steps"]),
+            str(row["gaussians"]),
+            psnr,
+            f"{row['ssim']:.3f}",
+            f"{row['lpips']:.3f}",
+            "not measured" if row["peak_rss_mib"] is None else f"{row['peak_rss_mib']:.0f} MiB",
         )
 
 
@@ -214,7 +222,7 @@ TABLES: Mapping[str, Callable[[Any], Rows]] = {
     "splat_training": splat_training,
     "training_steps": training_steps,
     "methods": methods,
-    "one_minute": one_minute,
+    "minutes": minutes,
     "palettes": palettes,
     "restyle_town_gaussians": restyle_town_gaussians,
     "splat_restyle": splat_restyle,
@@ -247,7 +255,7 @@ def filled(path: Path, root: Path = ROOT) -> str:
 
 def drawn(root: Path = ROOT) -> str:
     """The drawing of `docs/images/minutes.svg`."""
-    _, found = read_result(result_files(root)["splat_training"])
+    _, found = read_result(result_files(root)["minutes"])
     found.pop(DERIVED, None)
     return drawing(found)
 
