@@ -101,6 +101,55 @@ def test_a_file(page: Any, tmp_path: Path) -> None:
     assert violations(page) == []
 
 
+def light_of_a_file(page: Any, tmp_path: Path) -> None:
+    """Open a file, and the light in it."""
+    page.goto(written(tmp_path / "page.html", seen(ball(500)), suns=4).as_uri())
+    page.wait_for_selector(".place.ready", timeout=120_000)
+    page.keyboard.press("l")
+    page.locator("#dome").wait_for()
+
+
+def light_of_a_server(page: Any, address: str) -> None:
+    """Open a scene, and the light in it."""
+    page.goto(address)
+    page.wait_for_selector(".place.drawn", timeout=120_000)
+    page.locator("#light").click()
+    page.wait_for_function("() => fprf.live.sun.panel", timeout=120_000)
+
+
+def test_the_light_of_a_file(page: Any, tmp_path: Path) -> None:
+    light_of_a_file(page, tmp_path)
+    assert violations(page) == []
+    page.get_by_role("button", name="Golden hour").click()
+    page.set_viewport_size({"width": 400, "height": 800})
+    page.wait_for_timeout(500)
+    assert violations(page) == []
+
+
+def test_the_light_of_a_scene(page: Any) -> None:
+    with ViewerServer(Access("127.0.0.1", None), 0) as server:
+        server.open(lambda: Viewed(seen(ball(300)), "ball", 1), warm=False)
+        light_of_a_server(page, server.address)
+        assert violations(page) == []
+        page.locator("#sun").focus()
+        page.keyboard.press("ArrowUp")
+        page.wait_for_function("() => fprf.live.state.sun.sun", timeout=120_000)
+        page.set_viewport_size({"width": 400, "height": 800})
+        page.wait_for_timeout(500)
+        assert violations(page) == []
+
+
+def test_escape_leads_from_a_panel_to_the_button_that_opened_it(page: Any, tmp_path: Path) -> None:
+    light_of_a_file(page, tmp_path)
+    focused = "() => document.activeElement.id"
+    for button, field in (("light", "sun"), ("see", "angle"), ("send", "link")):
+        if page.locator(f"#{field}").is_hidden():
+            page.locator(f"#{button}").press("Enter")
+        page.locator(f"#{field}").focus()
+        page.keyboard.press("Escape")
+        assert page.locator(f"#{field}").is_hidden() and page.evaluate(focused) == button
+
+
 STOPS = """() => {
   const all = [...document.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex]")];
   window.stops = all.filter((each) => !each.disabled && each.tabIndex >= 0 && each.type !== "file"
@@ -134,6 +183,11 @@ def focus_order(page: Any) -> None:
 def test_the_focus_goes_through_a_file_in_order(page: Any, tmp_path: Path) -> None:
     page.goto(written(tmp_path / "page.html", seen(ball(300))).as_uri())
     page.wait_for_selector(".place.ready", timeout=120_000)
+    focus_order(page)
+
+
+def test_the_focus_goes_through_the_light_in_order(page: Any, tmp_path: Path) -> None:
+    light_of_a_file(page, tmp_path)
     focus_order(page)
 
 

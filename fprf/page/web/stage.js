@@ -217,7 +217,9 @@ class Stage {
   unfold(id) {
     for (const [button, panel] of Object.entries(PANELS)) {
       const open = button === id && at(panel).hidden;
+      const focused = at(panel).contains(document.activeElement);
       at(panel).hidden = !open;
+      if (focused && !open) at(button).focus(); // who was in it goes on where it was opened
       at(button).setAttribute("aria-expanded", String(open));
     }
     this.sending.fill();
@@ -227,7 +229,8 @@ class Stage {
 
   /** @param {KeyboardEvent} event */
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || writes(event.target)) return;
+    const leaves = event.key === "Escape" && event.target instanceof Element && event.target.closest(".panel");
+    if (event.ctrlKey || event.metaKey || event.altKey || (writes(event.target) && !leaves)) return;
     const act = this.actOf(event);
     if (!act) return;
     act();
