@@ -448,7 +448,7 @@ class ViewerServer:
     async def _preview(self, request: Request) -> Response:
         data = await asyncio.to_thread(self.start.preview, request.query_params.get("name", ""))
         if data is None:
-            raise HTTPException(404, "no picture of this scene yet")
+            return Response(status_code=204)  # none yet; browsers write refusals into their console
         return Response(data, media_type="image/webp")
 
     async def _start_request(self, request: Request) -> Response:
