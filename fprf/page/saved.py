@@ -154,7 +154,7 @@ def made_of(page: PageFile, photographs: Mapping[str, Photograph]) -> Made:
     for key in page.keys:
         keys.append(PageKeyframe(key.camera, look_of(key.look)))
     return Made(
-        shelf=tuple(photographs[digest] for digest in page.shelf if digest in photographs),
+        shelf=tuple(photographs[digest] for digest in dict.fromkeys(page.shelf) if digest in photographs),
         look=look_of(page.look),
         kept=tuple((name, look_of(look)) for name, look in page.kept),
         keys=tuple(keys),
@@ -182,14 +182,20 @@ def write_page(
         for rule in sorted(look.rules, key=lambda rule: (rule.region, rule.action)):
             named = None if rule.photograph is None else digests[rule.photograph]
             rules.append((rule.region, rule.action, named))
-        mix = tuple((digests[photograph], weight) for photograph, weight in look.mix)
-        return LookFile(to_json(look.style), mix, tuple(rules))
+        mix: dict[str, float] = {}
+        for photograph, weight in look.mix:
+            mix[digests[photograph]] = mix.get(digests[photograph], 0.0) + weight
+        return LookFile(to_json(look.style), tuple(mix.items()), tuple(rules))
 
+    # A photograph that was dropped twice is one file, and one photograph when it comes back.
+    names: dict[str, str] = {}
+    for photograph in (*made.shelf, *used):
+        names.setdefault(digests[photograph], photograph.name)
     document = PageFile(
         format=1,
         of=of,
-        photographs={digests[each]: each.name for each in used},
-        shelf=tuple(digests[each] for each in made.shelf),
+        photographs=names,
+        shelf=tuple(dict.fromkeys(digests[each] for each in made.shelf)),
         look=file_of(made.look),
         kept=tuple((name, file_of(look)) for name, look in made.kept),
         keys=tuple(KeyFile(key.camera, file_of(key.look)) for key in made.keys),

@@ -272,6 +272,21 @@ def test_what_was_made_comes_back_with_the_scene(run: Path, world: World, listen
     assert {path.name for path in run.glob("page*")} == {"page"}
 
 
+def test_a_photograph_that_was_dropped_twice_comes_back_once(
+    run: Path, world: World, listener: Listener
+) -> None:
+    viewed = replace(view_of_run(open_run(run, "cpu")), pixels=64)
+    data = world.references[0].read_bytes()
+    with Session(viewed, listener.post) as session:
+        session.upload(data, "dusk.png")
+        session.upload(data, "dusk.png", join=True)
+        assert [each.name for each in session.state.shelf] == ["dusk.png", "dusk.png (2)"]
+    with Session(viewed, listener.post) as session:
+        listener.until(lambda: len(session.state.shelf) > 0)
+        assert [each.name for each in session.state.shelf] == ["dusk.png"]
+        assert [weight for _, weight in session.state.look.mix] == [2.0]
+
+
 def test_a_page_of_another_version_is_left_alone(run: Path, world: World, listener: Listener) -> None:
     (run / "page").mkdir()
     (run / "page" / "page.json").write_text('{"format": 99}')
