@@ -135,6 +135,8 @@ def test_drags_and_keys_move_the_camera_and_styles_change(page: Any) -> None:
     page.mouse.move(x + 60, y + 10, steps=4)
     page.mouse.up()
     turned = page.evaluate(POSE)
+    focus = "() => ['#canvas:focus', '#canvas:focus-visible'].map((each) => Boolean(document.querySelector(each)))"
+    assert page.evaluate(focus) == [True, False], "keys go there, and no frame is drawn around it"
     assert not np.allclose(start, turned, atol=0.05) and np.abs(pixels(page) - plain).mean() > 0.01
     page.keyboard.down("w")
     page.wait_for_timeout(300)

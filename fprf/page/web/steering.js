@@ -60,7 +60,6 @@ class Steering {
   /** @param {PointerEvent} event */
   down(event) {
     const { place, pointers } = this;
-    place.canvas.focus({ preventScroll: true });
     place.canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
     this.pressed = pointers.size === 1 ? { x: event.clientX, y: event.clientY, far: 0 } : null;
