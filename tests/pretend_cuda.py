@@ -21,13 +21,18 @@ neither.
 """
 
 import contextlib
+import sys
 from collections import Counter
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from fprf.ops.triplane import _compiles
+
 CUDA = torch.device("cuda:0")
+_ABSENT = object()
 MPS = torch.device("mps:0")
 SYNCS = (
     "aten._local_scalar_dense.default",
@@ -261,6 +266,10 @@ def pretend_cuda(memory: int = 1 << 34, *, mps: bool = False) -> Iterator[_Mode]
             "get_device_name": lambda device=None: "pretended",
             "is_bf16_supported": lambda including_emulation=True: True,
         },
+        # Builds of torch for CUDA ask in each step of an optimiser whether it is recorded.
+        torch.accelerator: {
+            "current_stream": lambda device=None: SimpleNamespace(is_capturing=lambda: False)
+        },
         torch.mps: {"recommended_max_memory": lambda: memory, "driver_allocated_memory": lambda: 0},
     }
     kept = {(owner, name): getattr(owner, name) for owner, names in replaced.items() for name in names}
@@ -268,6 +277,10 @@ def pretend_cuda(memory: int = 1 << 34, *, mps: bool = False) -> Iterator[_Mode]
         for name, value in names.items():
             setattr(owner, name, value)
     Pretended.where = MPS if mps else CUDA
+    # Builds of torch for CUDA bring Triton, which would look for a driver.
+    triton = sys.modules.get("triton", _ABSENT)
+    sys.modules["triton"] = None
+    _compiles.cache_clear()
     # Else `module.double()` changes the type of a wrapper and leaves what it wraps.
     torch.__future__.set_overwrite_module_params_on_conversion(True)
     try:
@@ -275,6 +288,10 @@ def pretend_cuda(memory: int = 1 << 34, *, mps: bool = False) -> Iterator[_Mode]
             yield mode
     finally:
         Pretended.where = CUDA
+        _compiles.cache_clear()
+        del sys.modules["triton"]
+        if triton is not _ABSENT:
+            sys.modules["triton"] = triton
         torch.__future__.set_overwrite_module_params_on_conversion(False)
         for (owner, name), value in kept.items():
             setattr(owner, name, value)

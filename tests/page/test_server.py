@@ -357,8 +357,9 @@ def test_before_the_scene_is_there_a_page_says_so() -> None:
         with pytest.raises(UsageError, match="no such run"):
             found.open(load)  # type: ignore[arg-type]
         for path in ("scene", "colours?name=x", "card?card=1", "gaussians", "film"):
-            with pytest.raises(urllib.error.HTTPError, match="400"):
+            with pytest.raises(urllib.error.HTTPError, match="400") as refused:
                 page_of(f"{address}{path}")
+            refused.value.close()
         with pytest.raises(UsageError, match="choose another port"):
             ViewerServer(HERE, found.port)
     with pytest.raises(OSError):
