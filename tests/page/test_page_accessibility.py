@@ -120,6 +120,7 @@ def light_of_a_server(page: Any, address: str) -> None:
 def test_the_light_of_a_file(page: Any, tmp_path: Path) -> None:
     light_of_a_file(page, tmp_path)
     assert violations(page) == []
+    assert page.evaluate("() => at('lighting').scrollWidth <= at('lighting').clientWidth")
     page.get_by_role("button", name="Golden hour").click()
     page.set_viewport_size({"width": 400, "height": 800})
     page.wait_for_timeout(500)
