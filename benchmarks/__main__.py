@@ -77,6 +77,10 @@ BENCHMARKS = {
         "the sun that towns were captured in, found from Gaussians of their tracer",
         "--towns 1 --clouded 1",
     ),
+    "reference_sun": Benchmark(
+        "the sun of photographs for --sun auto: pictures of towns in the sun and under clouds",
+        "--towns 1",
+    ),
     "sun_traced": Benchmark(
         "scenes of primitives captured under clouds, lit, against another renderer's paths",
         "--scenes yard --steps 60 --views 16 --suns 1 --samples 2",

@@ -11,6 +11,7 @@ import os
 import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 _BLOCK_OF_ZEROS = bytes(4096)
@@ -77,6 +78,15 @@ def files_in(folder: Path, pattern: str) -> list[Path]:
         return list(folder.glob(pattern))
     except OSError:
         return []
+
+
+def forget_oldest(folder: Path, count: int) -> None:
+    """Remove the tensor files of a folder but for so many, which were asked for last."""
+    with suppress(OSError):  # another process removes files, too: what is left the next one finds
+        files = [each for each in folder.glob("*.safetensors") if each.is_file()]
+        files.sort(key=lambda each: each.stat().st_mtime)
+        for old in files[:-count]:
+            old.unlink(missing_ok=True)
 
 
 def temporary_folder(name: str) -> Path | None:

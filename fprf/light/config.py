@@ -43,10 +43,17 @@ class SunConfig:
     """Light that falls on the scene in the place of the captured one, by a time of day; none = as captured, or
     that of a clear sky where `sun` is given.
     """
-    sun: tuple[float, float] | None = None
+    sun: tuple[float, float] | Literal["auto"] | None = None
     """AZIMUTH ELEVATION of the sun in degrees: clockwise from the direction of the first view, in [-360, 360],
     and above the horizon, in [0.5, 90]. none = at the height of `light`, on the side from which most of what the
-    views show is lit.
+    views show is lit. auto = there, too, with the colour, strength and softness that the references show in the sun
+    and in the shade; where they don't tell, the light is as without it.
+    """
+    sun_elevation: float | None = None
+    """Degrees of the sun above the horizon, in [0.5, 90], where `sun` does not say; none = as the light has it."""
+    sun_over_sky: tuple[float, float, float] | None = None
+    """Light of the sun on what faces it over that of the sky on what is level, in red, green and blue, each in
+    [0, 50]: the more, the darker are shadows. none = by the sun's elevation.
     """
     sun_strength: float = 1.0
     """Share of this light in the place of the captured one, in [0, 1]: at 0 colours stay bit for bit."""
@@ -62,15 +69,39 @@ class SunConfig:
     """Diameter of the sun in degrees, in [0, 5]: the larger, the softer are shadows far from what casts them."""
 
     def __post_init__(self) -> None:
-        if self.sun is not None:
+        if isinstance(self.sun, str):
+            self._check_auto()
+        elif self.sun is not None:
             between("sun", self.sun[0], -360.0, 360.0)
             between("sun", self.sun[1], 0.5, 90.0)
+        if self.sun_elevation is not None:
+            between("sun_elevation", self.sun_elevation, 0.5, 90.0)
+        for share in self.sun_over_sky or ():
+            between("sun_over_sky", share, 0.0, 50.0)
         between("sun_strength", self.sun_strength, 0.0, 1.0)
         between("sun_size", self.sun_size, 0.0, 5.0)
         for name in ("sun_colour", "sky_colour"):
             text = getattr(self, name)
             if text is not None:
                 parse_light_colour(name, text)
+
+    def _check_auto(self) -> None:
+        """Raise ConfigError for another word than auto, and for lights without a sun beside it."""
+        if self.sun != "auto":
+            raise ConfigError(
+                f"sun: {self.sun!r} is no place; write azimuth and elevation, for example -60 25, or auto"
+            )
+        if self.light in ("overcast", "blue-hour"):
+            raise ConfigError(
+                f"sun: auto needs a light with a sun, {self.light} has none; leave one of them out"
+            )
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """Azimuth and elevation that are asked for in degrees; None = found."""
+        if isinstance(self.sun, str):
+            return None
+        return self.sun
 
     @property
     def light_asked(self) -> bool:
@@ -82,8 +113,10 @@ class SunConfig:
         """A name of the light for files: that of the light, or where the sun stands; empty without one."""
         if self.light is not None:
             return self.light
+        if self.place is not None:
+            return f"sun-{self.place[0]:g}-{self.place[1]:g}"
         if self.sun is not None:
-            return f"sun-{self.sun[0]:g}-{self.sun[1]:g}"
+            return "sun-auto"
         if self.unlit:
             return "unlit"
         return ""

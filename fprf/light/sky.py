@@ -85,11 +85,7 @@ def sun_colour(elevation: float) -> Annotated[Tensor, "3"]:
 
 def light_of(config: SunConfig) -> Light:
     """The light of flags."""
-    elevation = 0.0
-    if config.sun is not None:
-        elevation = config.sun[1]
-    elif config.light is not None:
-        elevation = _USUAL_ELEVATIONS[config.light]
+    elevation = _elevation_of(config)
     sine = math.sin(math.radians(max(elevation, 0.5)))
     high = min(sine / math.sin(math.radians(30.0)), 1.0)
     sun = 127.5 * math.exp(-0.21 / sine) * sun_colour(max(elevation, 0.5))
@@ -119,9 +115,47 @@ def light_of(config: SunConfig) -> Light:
         sun = _chosen("sun_colour", config.sun_colour) * _luma(sun)
     if config.sky_colour is not None:
         sky = _chosen("sky_colour", config.sky_colour) * _luma(sky)
+    if config.sun_over_sky is not None:
+        over = torch.tensor(config.sun_over_sky)
+        if config.sky_colour is None:
+            # Where the two meet as usual they are white: a camera's balance, and the references' colours.
+            sky = _white(1 / (1 + _USUAL_SUN_SHARE * over)) * _luma(sky)
+        sun = over * sky
+        if config.sun_colour is not None:
+            sun = _chosen("sun_colour", config.sun_colour) * _luma(sun)
     return Light(sun, sky, horizon, zenith, brightness, elevation)
 
 
+def _elevation_of(config: SunConfig) -> float:
+    """Degrees of the sun above the horizon."""
+    if config.place is not None:
+        return config.place[1]
+    if config.sun_elevation is not None:
+        return config.sun_elevation
+    if config.light is not None:
+        return _USUAL_ELEVATIONS[config.light]
+    return _PLAIN_ELEVATION
+
+
+def elevation_of_warmth(warmth: float) -> float:
+    """Degrees of the sun above the horizon at which its red over the sky's is so many times its blue over that."""
+    degrees = list(range(_LOWEST_WARM_DEGREES, _HIGHEST_WARM_DEGREES + 1))
+    away = []
+    for elevation in degrees:
+        light = light_of(SunConfig(sun=(0.0, float(elevation))))
+        over = light.sun / light.sky
+        away.append(abs(math.log(float(over[0] / over[2]) / warmth)))
+    return float(degrees[away.index(min(away))])
+
+
+_LOWEST_WARM_DEGREES = 6
+"""Lower suns have shadows longer than most captures."""
+_HIGHEST_WARM_DEGREES = 50
+"""The sun's colour says little about higher ones."""
+_PLAIN_ELEVATION = 35.0
+"""Degrees above the horizon of a sun that nobody has placed (by eye)."""
+_USUAL_SUN_SHARE = 0.4
+"""Share of the sun's light on what faces it that surfaces meet in the mean, about (by eye)."""
 _USUAL_ELEVATIONS = {
     "noon": 55.0,
     "golden-hour": 8.0,

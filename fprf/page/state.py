@@ -21,7 +21,7 @@ from ..plugins import slots
 from ..plugins.slots import hints_of
 from ..style.config import StyleConfig, with_preset
 from ..style.dictionary import Reference
-from ..style.restyle import sun_of
+from ..style.seen_sun import light_of_style
 from . import messages
 from .messages import SHELF, Camera
 from .writer import CAPTURED
@@ -197,7 +197,7 @@ class Shown(NamedTuple):
         """The light that falls on it; None = the captured one. Maps are not lit."""
         if self.map != "none" or self.region is not None:
             return None
-        return sun_of(self.look.style)
+        return light_of_style(self.look.config()).config
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,6 +109,11 @@ def packed_light(illumination: Illumination, config: SunConfig, reach: Reach | N
         "horizon": (level * light.horizon).tolist(),
         "zenith": (level * light.zenith).tolist(),
     }
+    if config.sun == "auto" and bool(illumination.sky.any()):
+        # The sky stays as it is, but for what lies between a root and a line.
+        captured = illumination.captured_sky.fit
+        head["horizon"] = captured[0].tolist()
+        head["zenith"] = captured.sum(0).tolist()
     met = None
     if bool(light.sun.any()):
         met = _bytes(sun_share(received, sun))

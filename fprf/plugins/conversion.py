@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from ..errors import ConfigError
 from ..io.paths import as_path
@@ -45,6 +45,10 @@ def _converted(value: Any, hint: Any, name: str) -> Any:
         return _path(value, name)
     if str in kinds and isinstance(value, os.PathLike):
         return os.fspath(value)
+    if isinstance(value, str) and any(
+        value in get_args(kind) for kind in kinds if get_origin(kind) is Literal
+    ):
+        return value
     rows = []
     for kind in kinds:
         if get_origin(kind) is tuple:

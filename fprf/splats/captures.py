@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder
-from ..io.cache import cache_folder
+from ..io.cache import cache_folder, forget_oldest
 from ..io.images import to_uint8, write_image
 from ..io.tensorfiles import load_sealed, save_kept
 from ..ops.rasterise import MIN_ALPHA
@@ -170,7 +170,7 @@ def open_capture(
             return kept.semantics
 
         scene = _scene_of(gaussians, capture.antialiased, kept.cameras, known, encoder)
-        return replace(scene, origin=capture.origin)
+        return replace(_keeping_light(scene, cache), origin=capture.origin)
     scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
 
     def found() -> Semantics:
@@ -178,7 +178,13 @@ def open_capture(
         _save_findings(path, _Findings(scene.views, semantics))
         return semantics
 
+    scene = _keeping_light(scene, cache)
     return replace(scene, found=functools.cache(found), origin=capture.origin)
+
+
+def _keeping_light(scene: SplatScene, cache: Path | None) -> SplatScene:
+    """The scene, with what is found out about its light kept beside other findings."""
+    return with_illumination(scene, None if cache is None else cache / "light")
 
 
 class _Findings(NamedTuple):
@@ -217,14 +223,7 @@ def _save_findings(path: Path, found: _Findings) -> None:
     for field in fields(Cameras):
         views[f"camera.{field.name}"] = getattr(found.cameras, field.name)
     save_kept(path, {**views, **semantics_tensors(found.semantics)})
-    with suppress(OSError):  # another process removes files, too: what is left the next one finds
-        files = []
-        for each in path.parent.glob("*.safetensors"):
-            if each.is_file():
-                files.append(each)
-        files.sort(key=lambda each: each.stat().st_mtime)
-        for old in files[:-_MAX_CACHED_CAPTURES]:
-            old.unlink(missing_ok=True)
+    forget_oldest(path.parent, _MAX_CACHED_CAPTURES)
 
 
 @dataclass(frozen=True, eq=False)

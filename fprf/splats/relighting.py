@@ -106,6 +106,8 @@ class Illumination:
     """Level direction of the first view: azimuth 0."""
     colours: Annotated[Tensor, "N 3"]
     """As captured, mean over directions, sRGB."""
+    known_sun: tuple[CapturedSun | None, ...] = ()
+    """The sun of the capture, where it was sought before; () = it is sought when it is first asked for."""
 
     @property
     def points(self) -> Annotated[Tensor, "N 3"]:
@@ -173,6 +175,8 @@ class Illumination:
     @cached_property
     def captured_sun(self) -> CapturedSun | None:
         """The sun of the capture; None under clouds and in the shade."""
+        if self.known_sun:
+            return self.known_sun[0]
         every = math.ceil(len(self.far) / _SOUGHT_BLOCKERS)
         if every == 1:
             return self._sought_sun()
@@ -256,8 +260,8 @@ class Illumination:
         """
         light = light_of(config)
         azimuth = 0.0
-        if config.sun is not None:
-            azimuth = config.sun[0]
+        if config.place is not None:
+            azimuth = config.place[0]
         elif bool(light.sun.any()):
             azimuth = self.azimuth
         sun = self.sun_direction(azimuth, light.elevation)
@@ -275,7 +279,10 @@ class Illumination:
             light, sun, received = self.under(config)
             colours = gain * (self.colours + LINEAR_OFFSET) - LINEAR_OFFSET
             gain = gain * gains(received, light, sun, self.up, colours, self.metered)
-            if bool(self.sky.any()):
+            if config.sun == "auto":
+                # The sky keeps the colours of the references, which show it in that light.
+                gain[self.sky] = 1.0
+            elif bool(self.sky.any()):
                 gain[self.sky] = self.sky_gain(light)
         return 1 + config.sun_strength * (gain - 1)
 

@@ -9,6 +9,7 @@ shows (`photographs`).
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import ParsedScene
 from ..interfaces import Encoder
+from ..io.cache import cache_folder
 from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras, directions_of, intrinsics_of, pixel_grid
 from ..rendering.renderer import enlarged
@@ -29,6 +31,7 @@ from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .drawing import SeenMeans, draw, seen_means
 from .gaussians import GaussianRows, Gaussians
+from .kept_light import kept_illumination
 from .levels import Levels, StyledLevels
 from .pinholes import camera_of, cover, covering, distorted
 from .relighting import Illumination, captured_light_note, find_illumination, mixed_gain, relit_harmonics
@@ -347,9 +350,18 @@ def illuminated(scene: SplatScene) -> Illumination:
     return find_illumination(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
 
 
-def with_illumination(scene: SplatScene) -> SplatScene:
-    """The scene with its illumination, which is found once, when it is first asked for."""
-    return replace(scene, illumination=cache(lambda: illuminated(scene)))
+def with_illumination(scene: SplatScene, folder: Path | None = None) -> SplatScene:
+    """The scene with its illumination, which is found once, when it is first asked for, and kept in a folder;
+    None = that of the user's cache.
+    """
+
+    def known() -> Illumination:
+        kept_in = folder or cache_folder("light")
+        return kept_illumination(
+            kept_in, scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near
+        )
+
+    return replace(scene, illumination=cache(known))
 
 
 @dataclass(frozen=True, eq=False)

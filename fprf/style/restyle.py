@@ -3,7 +3,7 @@ single regions.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from ..errors import ConfigError, UsageError
-from ..light.config import SunConfig
 from ..scenes import Scene
 from ..testing.outputs import check_stylizer
-from .config import NO_MASK, StyleConfig, labels
+from .config import NO_MASK, labels
 from .dictionary import Encoders, Reference, StyleDictionary, build_dictionary, encode_photograph
 from .files import Keyframe, StyleFile, check_photographs, fade, read_style, with_folders
 from .light import light_of
@@ -23,6 +22,7 @@ from .matching import unit
 from .placed_light import placed_light
 from .regions import RegionControls, Regions, region_controls
 from .scene_style import RegionWeight, SceneStyle, own_style
+from .seen_sun import light_of_style
 
 
 class Codes(NamedTuple):
@@ -125,6 +125,7 @@ def apply_dictionary(
         raise UsageError(
             "--pin: places are for Gaussians; for a run of fields pin regions, such as --pin 3=autumn.jpg"
         )
+    known = light_of_style(style)
     config = style.stylizer
     device = scene.device
     partly = bool((controls.strength != 1).any())
@@ -168,7 +169,7 @@ def apply_dictionary(
             features=config.features,
             colours=None if colours is None else colours.to(device),
             luminance=style.luminance,
-            sun=sun_of(style),
+            sun=known.config,
             light=None if light is None else light.to(device),
             placed=None if placed is None else placed.to(device),
         )
@@ -177,6 +178,8 @@ def apply_dictionary(
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene_style.semantic_mean))
     if config.light:
         controls = controls._replace(notes=(*controls.notes, *_recognised(dictionary)))
+    if known.note:
+        controls = controls._replace(notes=(*controls.notes, known.note))
     return Styled(replace(look(controls.allowed), places=places), dictionary, scene_style, codes, controls)
 
 
@@ -190,16 +193,6 @@ def _recognised(dictionary: StyleDictionary) -> list[str]:
                 f"{dictionary.names[i]}: shows this very place ({agreeing}); its light is measured there"
             )
     return lines
-
-
-def sun_of(style: StyleConfig) -> SunConfig | None:
-    """The light of a style; None = the captured one."""
-    if not style.lit:
-        return None
-    values = {}
-    for field in fields(SunConfig):
-        values[field.name] = getattr(style, field.name)
-    return SunConfig(**values)
 
 
 def _light_alone(scene: Scene, file: StyleFile, encoders: Encoders) -> Styled:

@@ -11,8 +11,9 @@ from tiny_world import World
 from fprf.api import FinishedCapture
 from fprf.cli import main as cli
 from fprf.errors import UsageError
+from fprf.io.images import write_image
 from fprf.light.config import SunConfig
-from fprf.light.relight import LINEAR_OFFSET
+from fprf.light.relight import LINEAR_OFFSET, SHOULDER, encoded
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
@@ -115,6 +116,8 @@ def test_no_strength_is_the_file_bit_for_bit(tmp_path: Path) -> None:
 SECOND: dict[str, object] = {
     "light": "moonlight",
     "sun": (-60.0, 20.0),
+    "sun_elevation": 20.0,
+    "sun_over_sky": (2.0, 1.0, 0.5),
     "sun_strength": 0.5,
     "sun_colour": "3000K",
     "sky_colour": "#4080ff",
@@ -156,8 +159,43 @@ def test_a_second_value_changes_the_light(scene: SplatScene, name: str) -> None:
     if name == "unlit":
         scene = in_the_sun(scene, (60.0, 35.0))
     assert SECOND.keys() == vars(SunConfig()).keys()
-    other = replace(NOON, **{name: SECOND[name]})  # type: ignore[arg-type]
-    assert float((lit(scene, other).light_gain - lit(scene, NOON).light_gain).abs().max()) > 1e-3
+    noon = NOON
+    if name == "sun_elevation":
+        noon = SunConfig(light="noon")
+    other = replace(noon, **{name: SECOND[name]})  # type: ignore[arg-type]
+    assert float((lit(scene, other).light_gain - lit(scene, noon).light_gain).abs().max()) > 1e-3
+
+
+def shaded_strips(path: Path, strength: tuple[float, float, float]) -> Path:
+    """A photograph of four materials side by side, lit but for a shadow across them."""
+    colours = torch.tensor([[0.10, 0.11, 0.12], [0.12, 0.20, 0.06], [0.25, 0.10, 0.07], [0.22, 0.20, 0.15]])
+    light = torch.ones(180, 1, 3) + torch.tensor(strength)
+    light[60:110] = 1.0
+    light = light * colours.repeat_interleave(60, 0)
+    write_image(path, encoded(light / (1 + SHOULDER * light)).clamp(0, 1).mul(255).round().byte().numpy())
+    return path
+
+
+def test_the_sun_of_references_falls_on_the_scene(scene: SplatScene, tmp_path: Path) -> None:
+    sunny = shaded_strips(tmp_path / "sunny.png", (3.0, 2.2, 1.3))
+    even = shaded_strips(tmp_path / "even.png", (0.0, 0.0, 0.0))
+    style = StyleConfig(references=(even, sunny), sun="auto")
+    found = apply_style(scene, StyleFile(style))
+    light = found.restyle.sun
+    assert light is not None and light.sun_over_sky is not None
+    assert light.sun_over_sky[0] > light.sun_over_sky[1] > light.sun_over_sky[2] > 1.0
+    assert any("sunny.png" in note for note in found.controls.notes)
+    lit_by = scene.restyled(found.restyle)
+    assert float(lit_by.light_gain.std()) > 0.05
+    # Nothing else is in a style file than the word.
+    write_style(tmp_path / "style.json", StyleFile(style))
+    assert read_style(tmp_path / "style.json").style.sun == "auto"
+    # What does not tell changes nothing.
+    untold = apply_style(scene, StyleFile(replace(style, references=(even,))))
+    assert untold.restyle.sun is None
+    assert any("stays as captured" in note for note in untold.controls.notes)
+    with pytest.raises(UsageError, match="name at least one"):
+        apply_style(scene, StyleFile(StyleConfig(sun="auto")))
 
 
 def test_lights_fade_into_each_other(scene: SplatScene) -> None:
@@ -252,3 +290,19 @@ def test_a_capture_far_from_the_origin_is_lit_alike() -> None:
     apart = (gains[0] - gains[1]).abs().mean(1)
     # Float32 tells places to a two-thousandth there, a tenth of what takes no light away.
     assert float(apart.median()) < 0.02 and float(apart.quantile(0.9)) < 0.2
+
+
+def test_what_was_found_about_light_is_kept(scene: SplatScene, tmp_path: Path) -> None:
+    sunny = in_the_sun(scene, (60.0, 35.0))
+    first = with_illumination(sunny, tmp_path)
+    found = first.light_found
+    (file,) = tmp_path.iterdir()
+    again = with_illumination(sunny, tmp_path).light_found
+    assert again.known_sun and found.captured_sun is not None and again.captured_sun is not None
+    assert again.captured_sun.azimuth == pytest.approx(found.captured_sun.azimuth, abs=1e-4)
+    for config in (NOON, SunConfig(unlit=True)):
+        assert torch.equal(again.gain(config), found.gain(config))
+    # Other Gaussians, and a damaged file, are looked at again.
+    assert with_illumination(scene, tmp_path).light_found.captured_sun is None
+    file.write_bytes(b"torn")
+    assert torch.equal(with_illumination(sunny, tmp_path).light_found.gain(NOON), found.gain(NOON))
