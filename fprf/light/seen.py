@@ -31,11 +31,11 @@ _STEP = 3
 """Pixels between places."""
 _PLACE = 5
 """Pixels across a place."""
-_MAX_DEVIATION = 0.1
+_MAX_PLACE_DEVIATION = 0.1
 """Of log luma within a place; others show borders."""
 _OFFSETS = ((0, 3), (3, 0), (2, 2), (2, -2), (0, 5), (5, 0), (4, 4), (4, -4), (0, 8), (8, 0))
 """Rows and columns of places between the two of a pair."""
-_DARKEST = 0.01
+_ADDED_LIGHT = 0.01
 """Added to light before logarithms are taken: below lies noise."""
 _MIN_LUMA = 0.012
 """Linear light of places that are compared."""
@@ -65,7 +65,7 @@ _MIN_PEAK = 1.3
 """Score over that of smaller changes of the same hue: slopes have less than one."""
 _SMALLER = (0.6, 0.7)
 """These, as shares of f."""
-_REFINEMENTS = 6
+_CHANGE_ROUNDS = 6
 """Rounds in which the change moves to the mean of what agrees."""
 _SKY_STEP = 3
 """Difference of neighbouring pixels of one sky, of 255."""
@@ -139,7 +139,7 @@ def seen_sun(photo: NDArray[np.uint8], shown: NDArray[np.bool_] | None = None) -
     red_over_blue = feature[1]
     mean = feature[0] - feature[2]
     strength = np.expm1([mean + red_over_blue / 2, feature[0], mean - red_over_blue / 2])
-    log_luma = np.log(light @ _LIGHT_OF_LUMA + _DARKEST)
+    log_luma = np.log(light @ _LIGHT_OF_LUMA + _ADDED_LIGHT)
     degrees = _sun_degrees(log_luma, pairs, agreeing)
     return SeenSun((float(strength[0]), float(strength[1]), float(strength[2])), degrees, score)
 
@@ -174,7 +174,7 @@ def _sky(photo: NDArray[np.uint8]) -> NDArray[np.bool_]:
         return none
     light = _scene_light(photo)
     luma = light @ _LIGHT_OF_LUMA
-    blue = np.log((light[..., 2] + _DARKEST) / (light[..., 0] + _DARKEST))
+    blue = np.log((light[..., 2] + _ADDED_LIGHT) / (light[..., 0] + _ADDED_LIGHT))
     brighter = np.median(luma[sky]) > _MIN_SKY_LIGHT * np.median(luma[~sky])
     bluer = np.median(blue[sky]) > np.median(blue[~sky]) + _MIN_SKY_BLUE
     return sky if brighter or bluer else none
@@ -184,12 +184,12 @@ def _compared(photo: NDArray[np.uint8], light: _Pixels, looked_at: NDArray[np.bo
     """Pairs of even places that differ in brightness."""
     luma = light @ _LIGHT_OF_LUMA
     told = looked_at & (photo.max(-1) < 255 * _MAX_VALUE) & (luma > _MIN_LUMA)
-    log_luma = np.log(luma + _DARKEST)
+    log_luma = np.log(luma + _ADDED_LIGHT)
     place = (_PLACE, _PLACE)
     variance = cv2.blur(log_luma * log_luma, place) - cv2.blur(log_luma, place) ** 2
     told = cv2.erode(told.astype(np.uint8), np.ones(place)) > 0
-    told = (told & (variance < _MAX_DEVIATION**2))[::_STEP, ::_STEP]
-    log_light = cv2.blur(np.log(light + _DARKEST), place)[::_STEP, ::_STEP]
+    told = (told & (variance < _MAX_PLACE_DEVIATION**2))[::_STEP, ::_STEP]
+    log_light = cv2.blur(np.log(light + _ADDED_LIGHT), place)[::_STEP, ::_STEP]
     rows, columns = told.shape
     changes = []
     darker = []
@@ -298,7 +298,7 @@ def _shared_change(
         return suns.score(feature) - _COOLER_WEIGHT * every.score(cooler * feature)
 
     best = max(_tried(), key=surplus)
-    for _ in range(_REFINEMENTS):
+    for _ in range(_CHANGE_ROUNDS):
         best = suns.moved(best)
     score = suns.score(best)
     smaller = max(every.score(share * best) for share in _SMALLER)

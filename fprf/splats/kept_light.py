@@ -21,7 +21,7 @@ from ..rendering.cameras import Cameras
 from .gaussians import Gaussians
 from .relighting import Illumination, find_illumination
 
-_VERSION = 1
+_LIGHT_CACHE_VERSION = 1
 """Of what is found: it counts up whenever the same scene gives something else."""
 _MAX_KEPT_SCENES = 24
 """Scenes of which the cache keeps it, 56 bytes a Gaussian each."""
@@ -50,7 +50,7 @@ def kept_illumination(
 
 def _key(gaussians: Gaussians, cameras: Cameras, antialiased: bool, near: float) -> str:
     """A name that follows from all that is looked at."""
-    digest = hashlib.sha256(f"{_VERSION} {antialiased} {near!r}".encode())
+    digest = hashlib.sha256(f"{_LIGHT_CACHE_VERSION} {antialiased} {near!r}".encode())
     shape = [
         gaussians.means,
         gaussians.quaternions,
