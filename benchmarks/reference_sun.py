@@ -1,6 +1,6 @@
 """The sun of photographs, found again: pictures of towns in the sun and under clouds, whose tracer knows it.
 
-    python -m benchmarks reference_sun [--towns 12] [--first 41] [--output JSON]
+    python -m benchmarks reference_sun [--towns 20] [--first 41] [--output JSON]
 
 Of each town one view is drawn in suns of three strengths and colours, anywhere from 20 to 60 degrees above the horizon,
 and under clouds. What the tracer shows with its sun and without it tells the truth behind the same camera: the median
@@ -44,7 +44,7 @@ _CUT_OFF = 0.97
 class ReferenceSunConfig:
     """Towns in the sun and under clouds."""
 
-    towns: int = 12
+    towns: int = 20
     """Towns, of one picture in each light."""
     first: int = 41
     """Seed of the first town."""

@@ -36,8 +36,8 @@ def shadow(soft: float = 0.0) -> NDArray[np.float64]:
 def test_strength_and_colour_are_found_whatever_the_materials() -> None:
     found = seen_sun(picture(shadow()))
     assert found is not None
-    # A tenth: 0.01 is added to light before logarithms are taken, a tenth of the darkest kind.
-    assert np.allclose(np.array(found.strength) + 1, STRENGTH + 1, rtol=0.1)
+    # 0.003 is added to light before logarithms are taken, a thirtieth of the darkest kind; the rest is noise.
+    assert np.allclose(np.array(found.strength) + 1, STRENGTH + 1, rtol=0.06)
 
 
 def test_softer_edges_are_those_of_a_larger_sun() -> None:
