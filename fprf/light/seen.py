@@ -13,6 +13,7 @@ with f in units of its deviations. Colours are brought before a camera's shoulde
 Shapes: a photograph of H W pixels, P pairs of places, K kinds.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
@@ -108,8 +109,8 @@ class _Pairs(NamedTuple):
 
     changes: Annotated[_Pixels, "P 3"]
     """Logarithms of the brighter one over the other, linear light."""
-    kinds: tuple[Annotated[NDArray[np.int64], "P"], Annotated[NDArray[np.int64], "P"]]
-    """By the colour of the darker one, in two ways: what lies at a border of one lies within one of the other."""
+    kinds: tuple[Annotated[NDArray[np.int64], "P"], ...]
+    """By the colour of the darker one, in eight ways: what spans less than half a kind is within one in some."""
     middles: Annotated[NDArray[np.int64], "P 2"]
     """Row and column between the two, in pixels."""
     across: Annotated[NDArray[np.int64], "P 2"]
@@ -210,7 +211,7 @@ def _compared(photo: NDArray[np.uint8], light: _Pixels, looked_at: NDArray[np.bo
     shaded = np.concatenate(darker)
     tint = shaded[:, 1] - (shaded[:, 0] + shaded[:, 2]) / 2
     place = np.stack([shaded @ _LIGHT_OF_LUMA, shaded[:, 0] - shaded[:, 2], tint], 1) / _KIND_SIZES
-    kinds = (_numbered(place), _numbered(place + 0.5))
+    kinds = tuple(_numbered(place + np.array(moved)) for moved in itertools.product((0.0, 0.5), repeat=3))
     return _Pairs(np.concatenate(changes), kinds, np.concatenate(middles), np.concatenate(across))
 
 
@@ -270,7 +271,7 @@ class _Scores:
         return np.asarray(np.exp(-(away**2).sum(1) / 2))
 
     def score(self, feature: NDArray[np.float64]) -> float:
-        """Score of a change, above; by that way of telling kinds which tells fewer."""
+        """Score of a change, above; by that way of telling kinds which tells fewest."""
         weight = self.agreeing(feature)
         return min(float(np.minimum(np.bincount(each, weight), _CAP).sum()) for each in self._kinds)
 
