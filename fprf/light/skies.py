@@ -4,7 +4,7 @@ Between the twigs of a bare crown a training puts the sky at the depth of the tw
 from them. In a view it has the colours of the sure sky nearby: Gaussians far out and above the horizon. So pixels
 above the horizon are compared with the mean of the sure sky in the smallest window that holds enough of it, and what
 they say is carried back to the Gaussians by their weights. Walls are darker than an overcast sky, and have another
-hue than a blue one.
+hue than a blue one. A clear sky grows darker and bluer with its height, so what is like it is taken as sure in turn.
 
 Shapes: views of H W pixels.
 """
@@ -39,6 +39,10 @@ _CHROMA_RANGE = (0.10, 0.16)
 """Sum of the differences of the shares of red, green and blue, from where all to where nothing is (by eye)."""
 MIN_SKY_HEIGHT = 0.02
 """Sine of the height above the horizon of what may be the sky (by eye)."""
+_GROWTHS = 4
+"""Times that the sky is followed from what is sure of it."""
+_GROWN_LIKENESS = 0.95
+"""Likeness of what is taken as sure then (by eye)."""
 _LUMA_PARTS = np.array(LUMA, np.float32)
 
 
@@ -52,8 +56,15 @@ def sky_pixels(
 
     `image` is sRGB in [0, 1]; `sure` the share of each pixel that Gaussians show which lie where only the sky is.
     """
-    like = _likeness(linear(image).cpu().numpy(), (sure > _SURE_SHARE).cpu().numpy())
-    return (torch.from_numpy(like) * (heights(camera, up) > MIN_SKY_HEIGHT).cpu()).to(image)
+    colour = linear(image).cpu().numpy()
+    known = (sure > _SURE_SHARE).cpu().numpy()
+    above = (heights(camera, up) > MIN_SKY_HEIGHT).cpu().numpy()
+    like = _likeness(colour, known)
+    # A sky's colour changes over the view: what is surely like it tells what lies farther on.
+    for _ in range(_GROWTHS):
+        known = known | (above & (like > _GROWN_LIKENESS))
+        like = _likeness(colour, known)
+    return torch.from_numpy(like * above).to(image)
 
 
 def heights(camera: Pinhole, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "H W"]:

@@ -93,7 +93,9 @@ def light_of(config: SunConfig) -> Light:
     sky = 2 * 8.2 * sine**0.5 * kelvin_colour(clear)
     zenith = 0.8 * kelvin_colour(_DUSK_KELVIN)
     # Near a low sun's height the sky takes its colour.
-    horizon = 1.2 * _white(torch.lerp(sun_colour(max(elevation, 2.0)), kelvin_colour(7500.0), high))
+    horizon = 1.2 * _white(
+        torch.lerp(sun_colour(max(elevation, 2.0)), kelvin_colour(_HIGH_HORIZON_KELVIN), high)
+    )
     brightness = 1.0
     if config.light == "overcast":
         sun = torch.zeros(3)
@@ -124,6 +126,11 @@ def light_of(config: SunConfig) -> Light:
         if config.sun_colour is not None:
             sun = _chosen("sun_colour", config.sun_colour) * _luma(sun)
     return Light(sun, sky, horizon, zenith, brightness, elevation)
+
+
+def horizon_tint(light: Light) -> Annotated[Tensor, "3"]:
+    """Hue of a light's horizon over that of a high sun's; near 1 for one."""
+    return _white(light.horizon) / _white(kelvin_colour(_HIGH_HORIZON_KELVIN))
 
 
 def _elevation_of(config: SunConfig) -> float:
@@ -164,6 +171,8 @@ _USUAL_ELEVATIONS = {
     "moonlight": 40.0,
 }
 """Degrees of the sun of each light above the horizon, where no sun is given."""
+_HIGH_HORIZON_KELVIN = 7500.0
+"""Of the horizon under a high sun (by eye)."""
 LUMA = (0.2126, 0.7152, 0.0722)
 """Shares of linear red, green and blue in brightness (IEC 61966-2-1)."""
 

@@ -31,7 +31,7 @@ from ..light.relight import (
     sky_share,
     sun_share,
 )
-from ..splats.relighting import MAX_SKY_GAIN, MIN_SKY_COLOUR, Illumination, Reach
+from ..splats.relighting import MAX_HUE_GAIN, MAX_SKY_GAIN, MIN_BLUENESS, MIN_SKY_COLOUR, Illumination, Reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +90,8 @@ def surfaces_header(illumination: Illumination) -> dict[str, Any]:
         "most": MAX_GAIN,
         "mostSky": MAX_SKY_GAIN,
         "leastSky": MIN_SKY_COLOUR,
+        "leastBlue": MIN_BLUENESS,
+        "mostHue": MAX_HUE_GAIN,
     }
 
 
@@ -99,15 +101,16 @@ def packed_light(illumination: Illumination, config: SunConfig, reach: Reach | N
     """
     light, sun, received = illumination.under(config, reach)
     exposure = exposure_of(received, light, sun, illumination.up, illumination.colours, illumination.metered)
-    level = 1.0
+    horizon = light.horizon
+    zenith = light.zenith
     if bool(illumination.sky.any()):
-        level = illumination.captured_sky.level(light)
+        horizon, zenith = illumination.captured_sky.colours_in(light)
     head: dict[str, Any] = {
         "sun": (exposure * light.sun).tolist(),
         "sky": (exposure * light.sky).tolist(),
         "bounce": (exposure * bounced(light, sun, illumination.up)).tolist(),
-        "horizon": (level * light.horizon).tolist(),
-        "zenith": (level * light.zenith).tolist(),
+        "horizon": horizon.tolist(),
+        "zenith": zenith.tolist(),
     }
     if config.sun == "auto" and bool(illumination.sky.any()):
         # The sky stays as it is, but for what lies between a root and a line.

@@ -14,7 +14,7 @@ from ..light.captured import USUAL_STRENGTH, CapturedSun, LogLight, sky_ratio
 from ..light.config import SunConfig
 from ..light.relight import LINEAR_OFFSET, Received, affine_change, exposed_gain, gains, sun_share
 from ..light.skies import MIN_SKY_HEIGHT, sky_pixels
-from ..light.sky import Light, light_of
+from ..light.sky import LUMA, Light, horizon_tint, light_of
 from ..light.surfaces import Surfaces, find_surfaces
 from ..light.transport import (
     Blockers,
@@ -82,8 +82,12 @@ _MIN_LIKENESS = 0.6
 """Likeness to the sky of the pixels of a Gaussian of the sky, at least (by eye)."""
 MIN_SKY_COLOUR = 0.02
 """Linear light that a captured sky has at least."""
+MIN_BLUENESS = 0.2
+"""Logarithm of blue over red of a captured sky that counts as blue, at least (by eye)."""
 MAX_SKY_GAIN = 4.0
 """Of a sky's linear light (by eye)."""
+MAX_HUE_GAIN = 20.0
+"""Of a channel of a blue sky that turns grey: its red is so much darker (by eye)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,13 +291,24 @@ class Illumination:
         return 1 + config.sun_strength * (gain - 1)
 
     def sky_gain(self, light: Light) -> Annotated[Tensor, "S 3"]:
-        """Factors of colours + 0.055 that give the captured sky, in the mean at each height, the light's own
-        colours.
+        """Factors of colours + 0.055 that give the captured sky, in the mean at each height, the light's own colours.
+
+        Where the captured sky is bluer than these, clouds and what is between them take one hue: of both only the
+        brightness stays. Else clouds would turn as much more orange as the blue turns grey.
         """
         height = self.heights[self.sky].clamp(0, 1)[:, None]
-        mean = self.captured_sky.mean_at(height)
-        wanted = torch.lerp(light.horizon, light.zenith, height.sqrt())
-        gain: Tensor = (self.captured_sky.level(light) * wanted / mean).clamp_max(MAX_SKY_GAIN).pow(1 / 2.4)
+        captured = self.captured_sky
+        mean = captured.mean_at(height)
+        horizon, zenith = captured.colours_in(light)
+        wanted = torch.lerp(horizon, zenith, height.sqrt())
+        own = (self.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
+        luma = torch.tensor(LUMA)
+        brighter = ((own @ luma) / (mean @ luma))[:, None]
+        one_hue = (wanted * brighter / own.clamp_min(MIN_SKY_COLOUR)).clamp_max(MAX_HUE_GAIN)
+        blue = blueness(mean)
+        share = ((blue - blueness(wanted)) / blue.clamp_min(MIN_BLUENESS)).clamp(0, 1)[:, None]
+        kept = (wanted / mean).clamp_max(MAX_SKY_GAIN)
+        gain: Tensor = torch.exp(torch.lerp(kept.log(), one_hue.log(), share) / 2.4)
         return gain
 
     @cached_property
@@ -324,12 +339,27 @@ class CapturedSky(NamedTuple):
         """Colours at sines of heights in [0, 1]."""
         return (self.fit[0] + height * self.fit[1]).clamp_min(MIN_SKY_COLOUR)
 
+    def colours_in(self, light: Light) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+        """Colours of the sky at the horizon and overhead in another light. A clear sky that was captured bluer than the
+        light's stays as it is in the sun, but for what a low sun makes of the horizon.
+        """
+        own = self.mean_at(torch.tensor([[0.0], [1.0]]))
+        if bool(light.sun.any()) and float(blueness(own[1])) > float(blueness(light.zenith)):
+            return light.brightness * own[0] * horizon_tint(light), light.brightness * own[1]
+        level = self.level(light)
+        return level * light.horizon, level * light.zenith
+
     def level(self, light: Light) -> float:
         """Brightness in another light: the sky stays as bright as it is, but for what the light asks."""
         level = light.brightness * self.brightness
         if bool(light.sun.any()):
             level *= _CLEAR_SKY_SHARE
         return level
+
+
+def blueness(colour: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
+    """Logarithm of blue over red of linear light."""
+    return (colour[..., 2] / colour[..., 0]).log()
 
 
 _CLEAR_SKY_SHARE = 0.75

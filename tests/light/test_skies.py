@@ -28,6 +28,19 @@ def test_what_has_the_colours_of_the_sky_nearby_and_stands_above_the_horizon_is_
     assert float(found[33:].max()) == 0.0
 
 
+def test_a_clear_sky_is_followed_to_where_it_is_darker_and_bluer() -> None:
+    pale = torch.tensor([0.55, 0.70, 0.95])
+    deep = torch.tensor([0.15, 0.35, 0.80])
+    image = torch.lerp(pale, deep, torch.linspace(0, 1, 96)[:, None]).expand(64, 96, 3).clone()
+    image[15:30, 60:80] = 0.9  # a white wall
+    image[30:] = 0.15
+    sure = torch.zeros(64, 96)
+    sure[:20, :20] = 1.0
+    found = sky_pixels(image, sure, CAMERA, UP)
+    assert float(found[:12, :80].min()) > 0.9
+    assert float(found[16:29, 61:79].max()) == 0.0
+
+
 def test_without_a_sure_sky_nothing_is_sky() -> None:
     image = torch.full((64, 96, 3), 0.7)
     assert float(sky_pixels(image, torch.zeros(64, 96), CAMERA, UP).max()) == 0.0

@@ -2,6 +2,7 @@
 
 import itertools
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from splat_ball import ball
 from fprf.errors import ConfigError
 from fprf.light.config import SunConfig
 from fprf.light.day import check_suns, day
-from fprf.light.relight import encoded, level_share, linear, sky_share, sun_share
+from fprf.light.relight import LINEAR_OFFSET, encoded, level_share, linear, sky_share, sun_share
 from fprf.page.suns import packed_day, packed_light, packed_surfaces, surfaces_header
 from fprf.page.writer import page_html
 from fprf.splats.scene import SplatScene
@@ -43,6 +44,28 @@ def test_bytes_are_within_half_a_step_of_what_they_stand_for(scene: SplatScene) 
     met = packed_light(known, NOON).met
     assert met is not None
     assert (np.abs(met / 255 - sun_share(received, sun).numpy()) <= HALF_STEP + 1e-6).all()
+
+
+def test_clouds_and_blue_take_one_hue_under_clouds_and_stay_in_the_sun(scene: SplatScene) -> None:
+    known = scene.light_found
+    colours = known.colours.clone()
+    rows = known.sky.nonzero()[:, 0]
+    colours[rows] = torch.tensor([0.25, 0.45, 0.85])
+    clouds = rows[::5]
+    colours[clouds] = torch.tensor([0.85, 0.87, 0.9])
+    blue = replace(known, colours=colours)
+
+    def hue(light: str, which: torch.Tensor) -> torch.Tensor:
+        gain = blue.gain(SunConfig(light=light))  # type: ignore[arg-type]
+        lit = (gain * (colours + LINEAR_OFFSET)).pow(2.4)[which]
+        return lit / lit.mean(1, keepdim=True)
+
+    # Of the sky's colours, as captured, those of the hue of clouds stay them, and their brightness alone tells them apart.
+    grey = hue("overcast", rows)
+    assert float((grey - grey.mean(0)).abs().max()) < 0.02 and float((grey.mean(0) - 1).abs().max()) < 0.02
+    captured = (colours + LINEAR_OFFSET).pow(2.4)[rows]
+    noon = hue("noon", rows)
+    assert float((noon - captured / captured.mean(1, keepdim=True)).abs().mean()) < 0.1
 
 
 def gain_of(scene: SplatScene, terms: dict[str, list[float]], level: NDArray[np.float64],

@@ -17,7 +17,7 @@ const SRGB_OFFSET = 0.055; // IEC 61966-2-1, also that of gains
  *
  * Bytes of the Gaussians whatever the light, and constants of its formulas.
  * @typedef {{level: Uint8Array, open: Uint8Array, head: SurfaceHead}} LitSurfaces
- * @typedef {{ahead: Vector, fit: ?number[][], shoulder: number, albedo: number, most: number, mostSky: number, leastSky: number}} SurfaceHead
+ * @typedef {{ahead: Vector, fit: ?number[][], shoulder: number, albedo: number, most: number, mostSky: number, leastSky: number, leastBlue: number, mostHue: number}} SurfaceHead
  *
  * Azimuth, clockwise from the direction of the first view, and elevation of a sun in degrees.
  * @typedef {[number, number]} SunPlace
@@ -57,6 +57,34 @@ const timeOf = (day, k) => {
  */
 const meanOf = (parts, name) => [0, 1, 2].map((c) => parts.reduce((sum, { terms, share }) => sum + share * terms[name][c], 0));
 
+/** @param {number[]} colour linear */
+const lumaOf = (colour) => 0.2126 * colour[0] + 0.7152 * colour[1] + 0.0722 * colour[2];
+
+/** Logarithm of blue over red. @param {number[]} colour linear */
+const bluenessOf = (colour) => Math.log(colour[2] / colour[0]);
+
+/**
+ * Factors of colours + 0.055 of a Gaussian of the sky, as `Illumination.sky_gain` computes them.
+ * @param {number[]} own linear
+ * @param {number} u sine of its height
+ * @param {number[]} horizon
+ * @param {number[]} zenith
+ * @param {number[][]} fit
+ * @param {SurfaceHead} head
+ */
+const skyGain = (own, u, horizon, zenith, fit, { mostSky, leastSky, leastBlue, mostHue }) => {
+  const mean = fit[0].map((base, c) => Math.max(leastSky, base + u * fit[1][c]));
+  const wanted = horizon.map((low, c) => low + Math.sqrt(u) * (zenith[c] - low));
+  const blue = bluenessOf(mean);
+  const share = bounded((blue - bluenessOf(wanted)) / Math.max(blue, leastBlue), 0, 1);
+  const brighter = lumaOf(own) / lumaOf(mean);
+  return wanted.map((light, c) => {
+    const kept = Math.min(mostSky, light / mean[c]);
+    const oneHue = Math.min(mostHue, light * brighter / Math.max(leastSky, own[c]));
+    return (kept ** (1 - share) * oneHue ** share) ** (1 / 2.4);
+  });
+};
+
 /**
  * Factors of colours + 0.055 of all Gaussians in lights that are mixed, as `Illumination.gain` computes them.
  * @param {LitSurfaces} surfaces
@@ -66,7 +94,7 @@ const meanOf = (parts, name) => [0, 1, 2].map((c) => parts.reduce((sum, { terms,
  * @returns {Float32Array} four numbers each
  */
 const gainsOf = ({ level, open, head }, parts, captured, strength) => {
-  const { fit, shoulder, albedo, most, mostSky, leastSky } = head;
+  const { fit, shoulder, albedo, most } = head;
   const count = level.length;
   const gains = new Float32Array(4 * count);
   const sky = meanOf(parts, "sky");
@@ -85,24 +113,24 @@ const gainsOf = ({ level, open, head }, parts, captured, strength) => {
     before.push(Float64Array.from(colours, (colour) => colour + SRGB_OFFSET));
     scene.push(Float64Array.from(colours.map(linearOf), (y) => y / (1 - shoulder * y)));
   }
+  const own = [0, 0, 0];
   for (let i = 0; i < count; i++) {
     const u = level[i] / 255;
+    if (!open[i] && fit) {
+      for (let c = 0; c < 3; c++) own[c] = before[c][captured.rows[4 * i + c]] ** 2.4;
+      const found = skyGain(own, u, horizon, zenith, fit, head);
+      for (let c = 0; c < 3; c++) gains[4 * i + c] = 1 + strength * (found[c] - 1);
+      continue;
+    }
     const unblocked = open[i] / 255;
     const white = u + (1 - u) * albedo;
     for (let c = 0; c < 3; c++) {
-      let gain = 1;
-      if (!open[i] && fit) {
-        const mean = Math.max(leastSky, fit[0][c] + u * fit[1][c]);
-        const wanted = horizon[c] + Math.sqrt(u) * (zenith[c] - horizon[c]);
-        gain = Math.min(mostSky, wanted / mean) ** (1 / 2.4);
-      } else {
-        let direct = 0;
-        for (const { met, colour } of suns) direct += colour[c] * met[i];
-        const ratio = (direct / unblocked + u * sky[c] + (1 - u) * bounce[c]) / white;
-        const byte = captured.rows[4 * i + c];
-        const lit = ratio * scene[c][byte];
-        gain = Math.min(most, (encodedOf(lit / (1 + shoulder * lit)) + SRGB_OFFSET) / before[c][byte]);
-      }
+      let direct = 0;
+      for (const { met, colour } of suns) direct += colour[c] * met[i];
+      const ratio = (direct / unblocked + u * sky[c] + (1 - u) * bounce[c]) / white;
+      const byte = captured.rows[4 * i + c];
+      const lit = ratio * scene[c][byte];
+      const gain = Math.min(most, (encodedOf(lit / (1 + shoulder * lit)) + SRGB_OFFSET) / before[c][byte]);
       gains[4 * i + c] = 1 + strength * (gain - 1);
     }
   }
