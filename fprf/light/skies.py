@@ -4,7 +4,7 @@ Between the twigs of a bare crown a training puts the sky at the depth of the tw
 from them. In a view it has the colours of the sure sky nearby: Gaussians far out and above the horizon. So pixels
 above the horizon are compared with the mean of the sure sky in the smallest window that holds enough of it, and what
 they say is carried back to the Gaussians by their weights. Walls are darker than an overcast sky, and have another
-hue than a blue one. A clear sky grows darker and bluer with its height, so what is like it is taken as sure in turn.
+hue than a blue one.
 
 Shapes: views of H W pixels.
 """
@@ -43,6 +43,8 @@ _GROWTHS = 4
 """Times that the sky is followed from what is sure of it."""
 _GROWN_LIKENESS = 0.95
 """Likeness of what is taken as sure then (by eye)."""
+_BLUE_RATIO = 1.5
+"""Blue over red of a clear sky, at least (by eye)."""
 _LUMA_PARTS = np.array(LUMA, np.float32)
 
 
@@ -51,8 +53,9 @@ def sky_pixels(
     sure: Annotated[Tensor, "H W"],
     camera: Pinhole,
     up: Annotated[Tensor, "3"],
-) -> Annotated[Tensor, "H W"]:
-    """Likeness of the pixels of a view to the sky, in [0, 1].
+) -> tuple[Annotated[Tensor, "H W"], Annotated[Tensor, "H W"]]:
+    """Likeness of the pixels of a view to the sky, in [0, 1], and the same where a blue sky is followed over the view:
+    it grows darker and bluer with its height. Of a grey one walls would be taken, too.
 
     `image` is sRGB in [0, 1]; `sure` the share of each pixel that Gaussians show which lie where only the sky is.
     """
@@ -60,11 +63,16 @@ def sky_pixels(
     known = (sure > _SURE_SHARE).cpu().numpy()
     above = (heights(camera, up) > MIN_SKY_HEIGHT).cpu().numpy()
     like = _likeness(colour, known)
-    # A sky's colour changes over the view: what is surely like it tells what lies farther on.
-    for _ in range(_GROWTHS):
-        known = known | (above & (like > _GROWN_LIKENESS))
-        like = _likeness(colour, known)
-    return torch.from_numpy(like * above).to(image)
+    followed = like
+    if known.any() and _is_blue(colour[known].mean(0)):
+        for _ in range(_GROWTHS):
+            known = known | (above & (followed > _GROWN_LIKENESS))
+            followed = _likeness(colour, known)
+    return torch.from_numpy(like * above).to(image), torch.from_numpy(followed * above).to(image)
+
+
+def _is_blue(colour: NDArray[np.float32]) -> bool:
+    return bool(colour[2] > _BLUE_RATIO * colour[0])
 
 
 def heights(camera: Pinhole, up: Annotated[Tensor, "3"]) -> Annotated[Tensor, "H W"]:

@@ -21,7 +21,7 @@ from ..rendering.cameras import Cameras
 from .gaussians import Gaussians
 from .relighting import Illumination, find_illumination
 
-_LIGHT_CACHE_VERSION = 2
+_LIGHT_CACHE_VERSION = 3
 """Of what is found: it counts up whenever the same scene gives something else."""
 _MAX_KEPT_SCENES = 24
 """Scenes of which the cache keeps it, 56 bytes a Gaussian each."""

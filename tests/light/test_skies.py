@@ -19,13 +19,14 @@ def test_what_has_the_colours_of_the_sky_nearby_and_stands_above_the_horizon_is_
     image[12:28, 70:90] = 0.5  # a grey wall
     image[5:8, 62:66] = torch.tensor([0.2, 0.45, 0.9])  # a blue sheet
     image[50:60, 20:40] = torch.tensor([0.68, 0.70, 0.74])  # a pond
-    found = sky_pixels(image, sure, CAMERA, UP)
+    found, followed = sky_pixels(image, sure, CAMERA, UP)
     assert float(found[:20, :40].min()) > 0.95
     assert float(found[:28, 41:60:3].min()) > 0.95
     assert float(found[:30, 40:60:3].max()) == 0.0
     assert float(found[12:28, 70:90].max()) == 0.0
     assert float(found[5:8, 62:66].max()) == 0.0
     assert float(found[33:].max()) == 0.0
+    assert torch.equal(found, followed), "a grey sky is not followed"
 
 
 def test_a_clear_sky_is_followed_to_where_it_is_darker_and_bluer() -> None:
@@ -36,14 +37,15 @@ def test_a_clear_sky_is_followed_to_where_it_is_darker_and_bluer() -> None:
     image[30:] = 0.15
     sure = torch.zeros(64, 96)
     sure[:20, :20] = 1.0
-    found = sky_pixels(image, sure, CAMERA, UP)
-    assert float(found[:12, :80].min()) > 0.9
-    assert float(found[16:29, 61:79].max()) == 0.0
+    found, followed = sky_pixels(image, sure, CAMERA, UP)
+    assert float(found[:12, 70:].max()) == 0.0
+    assert float(followed[:12, :80].min()) > 0.9
+    assert float(followed[16:29, 61:79].max()) == 0.0
 
 
 def test_without_a_sure_sky_nothing_is_sky() -> None:
     image = torch.full((64, 96, 3), 0.7)
-    assert float(sky_pixels(image, torch.zeros(64, 96), CAMERA, UP).max()) == 0.0
+    assert all(float(found.max()) == 0.0 for found in sky_pixels(image, torch.zeros(64, 96), CAMERA, UP))
 
 
 def test_heights_are_those_of_rays() -> None:
