@@ -266,7 +266,7 @@ class _Scores:
         self._kinds = kinds
 
     def agreeing(self, feature: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far pairs agree with a change [P], in [0, 1]."""
+        """Agreement of pairs with a change [P], in [0, 1]."""
         away = (self._features - feature) / _DEVIATIONS
         return np.asarray(np.exp(-(away**2).sum(1) / 2))
 

@@ -261,7 +261,7 @@ def packed_scene(
 
 
 def _look_inwards(cameras: Cameras) -> bool:
-    """Whether cameras stand about what they look at, and not within it."""
+    """True where cameras stand about what they look at, and not within it."""
     place = cameras.pose[:, :, 3]
     return float(((place.mean(0) - place) * -cameras.pose[:, :, 2]).sum(1).mean()) > 0
 

@@ -1,5 +1,5 @@
-"""What was found out about the light on a scene, between one command and the next: surfaces, openness, the sky and
-the captured sun, in the cache, by the content of Gaussians and views.
+"""The light on a scene as it was found, kept from one command to the next: surfaces, openness, the sky and the captured
+sun, in the cache, by the content of Gaussians and views.
 """
 
 import hashlib
@@ -69,7 +69,7 @@ def _key(gaussians: Gaussians, cameras: Cameras, antialiased: bool, near: float)
 
 
 def _read(path: Path, gaussians: Gaussians) -> Illumination | None:
-    """What a file of the cache keeps; None where there is none, or none sound."""
+    """Content of a file of the cache; None where there is none, or none sound."""
     if not os.path.isfile(path):  # False also where the folder is closed to us
         return None
     try:
