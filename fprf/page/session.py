@@ -352,7 +352,7 @@ class Session:
             self._colour_kept(before, now)
         if now.picked is not None and now.look != before.look:
             region = now.picked.region  # what it takes has changed
-            self._worker.run("select", lambda: self._select(region))
+            self._worker.run("select", lambda: self._describe(region))
         # What is seen is drawn again only where it is another; names and lists of the page cost a message
         # alone.
         if now.shown.unlit != before.shown.unlit:
@@ -646,6 +646,17 @@ class Session:
         if region is not None:
             picked = self.restyler.region_info(self.state.look, region)
         self.apply(lambda state: replace(state, picked=picked))
+
+    def _describe(self, region: int) -> None:
+        """Say anew what the picked region takes, unless another was picked or it was closed meanwhile."""
+        found = self.restyler.region_info(self.state.look, region)
+
+        def described(state: SharedState) -> SharedState:
+            if state.picked is None or state.picked.region != region:
+                return state
+            return replace(state, picked=found)
+
+        self.apply(described)
 
     def _record(self, film: messages.Film) -> None:
         """Make a film in the scene's folder while no client waits for a picture, one at a time."""

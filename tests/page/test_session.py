@@ -136,6 +136,8 @@ def test_a_click_picks_a_region_and_its_rules_change_the_look(
     session.handle(1, messages.Region(action="close"))
     assert not session.state.look.rules
     listener.until(lambda: session.state.picked is None)
+    session._describe(region)  # as asked before it was closed
+    assert session.state.picked is None
 
 
 def test_what_is_wrong_is_said_and_changes_nothing(session: Session, world: World) -> None:
