@@ -187,7 +187,7 @@ class StyleConfig(SunConfig):
     bold: float = 0.65
     """Strength of the paint on things that the references do not surely show, in [0, 1]: 0 = everything takes
     light alone, 0.5 = as far as the match is sure, 1 = everything is painted. Counts where `stylizer.light`
-    is true. The default is a little more than sure: of 0.5 to 1 it loses least on any kind of photograph.
+    is true. The default paints a little more than is sure.
     """
     pin: tuple[str, ...] = ()
     """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to
