@@ -20,12 +20,13 @@ SLOWEST = 0.3  # time goes the slower the lower the sun stands: at the horizon a
 
 
 def write_day(scene: SplatScene, folder: Path, frames: int, fps: float, width: int) -> None:
-    """Write path.json (a spiral), keys.json and a style for each sun; at noon most of what is seen is lit."""
+    """Write path.json (a spiral), keys.json and a style for each sun."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = spiral(scene.cameras, frames)
     cameras = cameras.scaled(float(cameras.size[0, 0]) / width)
     write_camera_path(folder / "path.json", cameras, fps, scene.origin)
-    hours = day(SUNS, scene.light_found.azimuth)
+    light = scene.light_found
+    hours = day(SUNS, light.noon, clockwise=light.clockwise)
     times = [0.0]
     for before, after in itertools.pairwise(hours):
         height = math.sin(math.radians((before.elevation + after.elevation) / 2))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .datamanagers.scene import ParsedScene
     from .progress import Display
     from .rendering.cameras import Cameras
+    from .rendering.north import North
     from .splats.gaussians import GaussianRows
     from .style.dictionary import Encoders
     from .style.look import Restyle
@@ -76,6 +77,11 @@ class Scene(ABC):
         `rendering.local_frame`).
         """
         return (0.0, 0.0, 0.0)
+
+    @property
+    def north(self) -> "North | None":
+        """Where north lies in its world; None where nothing tells it."""
+        return None
 
     @property
     @abstractmethod

@@ -311,12 +311,13 @@ def _size(folder: Path) -> int:
 
 
 def scene_folder(data: Path) -> Iterator[Finding]:
-    """Format, views, split, points and readable images of a scene. Raises DataError where it cannot be
+    """Format, views, split, north, points and readable images of a scene. Raises DataError where it cannot be
     parsed.
     """
     from ..datamanagers.images import colour_notes, load_images, transparent_fault, useless_masks
     from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
     from ..datamanagers.photograph_files import find_photographs
+    from ..datamanagers.positions import NORTH_NOTE
     from ..datamanagers.scene import find_sightings, sparser
 
     try:
@@ -340,12 +341,17 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
     yield Finding("views", f"{count} of {shown} pixels, {' and '.join(lenses)} lens")
     yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
+    north = "nothing tells it: azimuths of suns count from the direction of the first view"
     for note in scene.notes:
+        if note.startswith(NORTH_NOTE):
+            north = note.removeprefix(NORTH_NOTE)
+            continue
         found_masks, call, remedy = note.partition("; call ")  # masks of which none fits
         if remedy:
             yield Finding("masks", found_masks, (call + remedy).removeprefix("; "))
         else:
             yield Finding("note", note)
+    yield Finding("north", north)
     # Points begin the first Gaussians, where training views see them.
     if scene.points is None or not len(scene.points):
         yield Finding(
@@ -407,6 +413,8 @@ def capture_file(path: Path) -> Iterator[Finding]:
     yield Finding("gaussians", said, remedy, optional=True)
     up, reason = direction_up(capture)
     yield Finding("up", f"{axis_name(up)}: {reason}; --up says otherwise")
+    if capture.north is not None:
+        yield Finding("north", f"{axis_name(capture.north.direction)}: {capture.north.source}")
     # The last note of a capture that looks activated says that, too.
     for note in capture.notes[: -1 if capture.activation else None]:
         yield Finding("note", note)

@@ -160,15 +160,16 @@ def raw_kind_of(file: IO[bytes], name: object) -> str:
 
 
 def exif_of(file: IO[bytes], name: object) -> PIL.Image.Exif:
-    """The EXIF block of an open file; of a raw photograph what it says of its lens. Raises whatever Pillow
-    raises over a damaged one.
+    """The EXIF block of an open file; of a raw photograph what it says of its lens and its position. Raises
+    whatever Pillow raises over a damaged one.
     """
     if raw_kind_of(file, name):
         return raw_exif(file)
     image = open_image(file, name)[1]
     with silent():
         exif = image.getexif()
-        exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
+        for part in (IFD.Exif, IFD.GPSInfo):
+            exif.get_ifd(part)  # while the file is open: of a TIFF it is read only when asked for
     return exif
 
 

@@ -75,7 +75,7 @@ def raw_kind(head: bytes, directories: list[ImageFileDirectory_v2]) -> str:
 
 
 def raw_exif(file: IO[bytes]) -> PIL.Image.Exif:
-    """Lens of a raw photograph that is a TIFF: model and focal lengths; empty for others."""
+    """Lens and position of a raw photograph that is a TIFF: model, focal lengths and GPS; empty for others."""
     exif = PIL.Image.Exif()
     directories = tiff_directories(file)
     if not directories:
@@ -94,6 +94,8 @@ def raw_exif(file: IO[bytes]) -> PIL.Image.Exif:
             exif[tag] = value
         else:
             exif.get_ifd(IFD.Exif)[tag] = value
+    for offset in _numbers(directories[0], IFD.GPSInfo):
+        exif.get_ifd(IFD.GPSInfo).update(_directory_at(file, offset))
     return exif
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..rendering.cameras import Cameras, project
 from ..rendering.local_frame import local_origin
+from ..rendering.north import North
 from ..types import Origin
 
 
@@ -54,6 +55,8 @@ class ParsedScene:
     """Images carry transparency."""
     notes: tuple[str, ...] = ()
     """Decisions taken while the capture was read, a line each, for the user."""
+    north: North | None = None
+    """Where north lies, where the capture says it or the positions of its photographs tell it."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Subtracted from the capture's coordinates, along its own axes: cameras and points are relative to
     it.

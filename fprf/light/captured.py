@@ -37,7 +37,7 @@ class CapturedSun(NamedTuple):
     """A sun that a capture was taken in."""
 
     azimuth: float
-    """Degrees clockwise from the first view's direction."""
+    """Degrees clockwise from azimuth 0."""
     elevation: float
     """Degrees above the horizon."""
     explained: float

@@ -44,10 +44,14 @@ class SunConfig:
     that of a clear sky where `sun` is given.
     """
     sun: tuple[float, float] | Literal["auto"] | None = None
-    """AZIMUTH ELEVATION of the sun in degrees: clockwise from the direction of the first view, in [-360, 360],
-    and above the horizon, in [0.5, 90]. none = at the height of `light`, on the side from which most of what the
+    """AZIMUTH ELEVATION of the sun in degrees: clockwise from where `sun_from` says, in [-360, 360], and above
+    the horizon, in [0.5, 90]. none = at the height of `light`, on the side from which most of what the
     views show is lit. auto = there, too, with the colour, strength and softness that the references show in the sun
     and in the shade; where they don't tell, the light is as without it.
+    """
+    sun_from: Literal["north", "view"] = "north"
+    """Direction that the azimuth of `sun` counts from: north, and of a scene of which nothing tells it the direction of
+    the first view; view = that of the first view in any case.
     """
     sun_elevation: float | None = None
     """Degrees of the sun above the horizon, in [0.5, 90], where `sun` does not say; none = as the light has it."""

@@ -1,6 +1,7 @@
 """A day: where the sun stands from dawn to dusk. No torch.
 
-The sun goes along a great circle, clockwise as seen from above, and stands highest at 12 o'clock. An hour turns
+The sun goes along a great circle, clockwise as seen from above or, south of the equator, the other way round, and stands
+highest at 12 o'clock. An hour turns
 it by 15 degrees.
 """
 
@@ -44,7 +45,7 @@ class Hour(NamedTuple):
     config: SunConfig
 
 
-def day(suns: int, noon: float) -> list[Hour]:
+def day(suns: int, noon: float, *, clockwise: bool = True) -> list[Hour]:
     """Blue hour, so many suns at even steps, blue hour; `noon` is the azimuth of the highest sun in degrees."""
     turns = [-_DUSK_TURN]
     for k in range(suns):
@@ -52,7 +53,7 @@ def day(suns: int, noon: float) -> list[Hour]:
     turns.append(_DUSK_TURN)
     hours = []
     for turn in turns:
-        azimuth, elevation = sun_at(turn, noon)
+        azimuth, elevation = sun_at(turn, noon, clockwise=clockwise)
         config = SunConfig(light="blue-hour")
         if elevation > 0:
             config = SunConfig(sun=(azimuth, elevation))
@@ -60,10 +61,10 @@ def day(suns: int, noon: float) -> list[Hour]:
     return hours
 
 
-def sun_at(turn: float, noon: float) -> tuple[float, float]:
+def sun_at(turn: float, noon: float, *, clockwise: bool = True) -> tuple[float, float]:
     """Azimuth in [-180, 180) and elevation in degrees of the sun, `turn` degrees after noon."""
     highest = math.radians(_NOON_ELEVATION)
-    across = math.sin(math.radians(turn))
+    across = math.sin(math.radians(turn if clockwise else -turn))
     along = math.cos(math.radians(turn)) * math.cos(highest)
     height = math.cos(math.radians(turn)) * math.sin(highest)
     azimuth = (noon + math.degrees(math.atan2(across, along)) + 180) % 360 - 180

@@ -48,7 +48,7 @@ class Lighting:
         """Data for browsers, whatever the light: a head and planes of bytes."""
         illumination = self.find()
         hours: list[dict[str, Any]] = []
-        for hour in day(_SHOWN_SUNS, illumination.azimuth):
+        for hour in day(_SHOWN_SUNS, illumination.noon, clockwise=illumination.clockwise):
             hours.append({"hour": hour.hour, "at": [hour.azimuth, hour.elevation]})
         head = {**surfaces_header(illumination), "day": hours}
         planes = packed_surfaces(illumination)[:, self._order.numpy()]

@@ -72,7 +72,7 @@ class Sun(Message, tag="sun"):
 
     light: LightName | None = None
     sun: tuple[Annotated[float, Meta(ge=-360, le=360)], Annotated[float, Meta(ge=0.5, le=90)]] | None = None
-    """Azimuth and elevation in degrees."""
+    """Azimuth, as `SunConfig` counts it from north, and elevation in degrees."""
     strength: Share = 1.0
     moving: bool = False
     """It is being dragged: it may be shown coarsely."""

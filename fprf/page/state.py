@@ -429,7 +429,9 @@ class SharedState(Made):
                 return replace(self, look=replace(look, style=slots.replace(look.style, message.name, value)))
             case messages.Sun():
                 strength = round(message.strength, 4)
-                style = replace(look.style, light=message.light, sun=message.sun, sun_strength=strength)
+                style = replace(
+                    look.style, light=message.light, sun=message.sun, sun_from="north", sun_strength=strength
+                )
                 return replace(self, look=replace(look, style=style))
             case messages.Preset():
                 return replace(self, look=replace(look, style=with_preset(look.style, message.name)))
@@ -532,7 +534,12 @@ class SharedState(Made):
             "type": "state",
             "shelf": shelf,
             "look": sliders(self.look.style),
-            "sun": {"light": style.light, "sun": style.sun, "strength": style.sun_strength},
+            "sun": {
+                "light": style.light,
+                "sun": style.sun,
+                "from": style.sun_from,
+                "strength": style.sun_strength,
+            },
             "map": self.map,
             "picked": region,
             "kept": [name for name, _ in self.kept],

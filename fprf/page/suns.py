@@ -83,7 +83,9 @@ def surfaces_header(illumination: Illumination) -> dict[str, Any]:
     if bool(illumination.sky.any()):
         fit = illumination.captured_sky.fit.tolist()
     return {
-        "ahead": illumination.ahead.tolist(),
+        "ahead": illumination.zero.tolist(),
+        "north": illumination.north is not None,
+        "first": illumination.view_azimuth,
         "fit": fit,
         "shoulder": SHOULDER,
         "albedo": GROUND_ALBEDO,
@@ -125,9 +127,9 @@ def packed_light(illumination: Illumination, config: SunConfig, reach: Reach | N
 
 
 def packed_day(illumination: Illumination, suns: int) -> Suns:
-    """A day with so many suns; at noon most of what the views show is lit."""
+    """A day with so many suns."""
     lights = []
-    for hour in day(suns, illumination.azimuth):
+    for hour in day(suns, illumination.noon, clockwise=illumination.clockwise):
         light = packed_light(illumination, hour.config)
         place = {"hour": hour.hour, "at": [hour.azimuth, hour.elevation], "met": light.met is not None}
         lights.append(PackedLight(light.met, {**light.head, **place}))

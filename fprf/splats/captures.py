@@ -170,7 +170,8 @@ def open_capture(
             return kept.semantics
 
         scene = _scene_of(gaussians, capture.antialiased, kept.cameras, known, encoder)
-        return replace(_keeping_light(scene, cache), origin=capture.origin)
+        scene = replace(scene, origin=capture.origin, north=capture.north)
+        return _keeping_light(scene, cache)
     scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
 
     def found() -> Semantics:
@@ -178,8 +179,8 @@ def open_capture(
         _save_findings(path, _Findings(scene.views, semantics))
         return semantics
 
-    scene = _keeping_light(scene, cache)
-    return replace(scene, found=functools.cache(found), origin=capture.origin)
+    opened = replace(scene, found=functools.cache(found), origin=capture.origin, north=capture.north)
+    return _keeping_light(opened, cache)
 
 
 def _keeping_light(scene: SplatScene, cache: Path | None) -> SplatScene:

@@ -27,6 +27,7 @@ from ..light.transport import (
 from ..ops.harmonics import recoloured
 from ..ops.rasterise.rendering import Pinhole, lift
 from ..rendering.cameras import Cameras
+from ..rendering.north import North, world_axes
 from .drawing import draw
 from .gaussians import Gaussians, bulk_of
 from .pinholes import covering
@@ -74,6 +75,8 @@ _MAX_HARD_DEGREES = 1.0
 """Diameter up to which a sun is one place: its shadows are blurred by a sixtieth of their distance at most."""
 _AZIMUTHS = 8
 """Places around that are tried for a sun that nobody has placed."""
+_MIN_LEVEL_NORTH = 0.3
+"""Level part of a direction of north, at least: of less nothing is left once it is made level (by eye)."""
 _TRIED_ELEVATION = 20.0
 """Degrees above the horizon at which they are tried: between golden hour and noon."""
 _TRIED_GAUSSIANS = 8192
@@ -107,11 +110,15 @@ class Illumination:
     """Sines of their heights above the horizon, as the cameras see them."""
     up: Annotated[Tensor, "3"]
     ahead: Annotated[Tensor, "3"]
-    """Level direction of the first view: azimuth 0."""
+    """Level direction of the first view."""
     colours: Annotated[Tensor, "N 3"]
     """As captured, mean over directions, sRGB."""
     known_sun: tuple[CapturedSun | None, ...] = ()
     """The sun of the capture, where it was sought before; () = it is sought when it is first asked for."""
+    north: Annotated[Tensor, "3"] | None = None
+    """Level direction of north, where it is known."""
+    southern: bool | None = None
+    """The scene lies south of the equator, where that is known."""
 
     @property
     def points(self) -> Annotated[Tensor, "N 3"]:
@@ -129,19 +136,29 @@ class Illumination:
         """Deviation by which blockers are widened."""
         return _BLUR_SHARE * float(self.surfaces.widths.median())
 
+    @property
+    def zero(self) -> Annotated[Tensor, "3"]:
+        """Level direction of azimuth 0: north, or where that is not known the first view's."""
+        return self.ahead if self.north is None else self.north
+
+    @property
+    def view_azimuth(self) -> float:
+        """Azimuth of the first view's direction in degrees."""
+        return self.degrees_of(self.ahead)[0]
+
     def sun_direction(self, azimuth: float, elevation: float) -> Annotated[Tensor, "3"]:
-        """Unit vector to a sun at degrees clockwise from the first view's direction, and above the horizon."""
-        right = torch.linalg.cross(self.ahead, self.up)
+        """Unit vector to a sun at degrees clockwise from azimuth 0, and above the horizon."""
+        right = torch.linalg.cross(self.zero, self.up)
         turn = math.radians(azimuth)
         rise = math.radians(elevation)
-        level = math.cos(turn) * self.ahead + math.sin(turn) * right
+        level = math.cos(turn) * self.zero + math.sin(turn) * right
         sun: Tensor = math.cos(rise) * level + math.sin(rise) * self.up
         return sun
 
     def degrees_of(self, sun: Annotated[Tensor, "3"]) -> tuple[float, float]:
         """Azimuth in [-180, 180] and elevation of a unit vector, as `sun_direction` takes them."""
-        right = torch.linalg.cross(self.ahead, self.up)
-        azimuth = math.degrees(math.atan2(float(sun @ right), float(sun @ self.ahead)))
+        right = torch.linalg.cross(self.zero, self.up)
+        azimuth = math.degrees(math.atan2(float(sun @ right), float(sun @ self.zero)))
         return azimuth, math.degrees(math.asin(max(-1.0, min(1.0, float(sun @ self.up)))))
 
     def reach(self, sun: Annotated[Tensor, "3"], degrees: float = 0.0) -> Annotated[Tensor, "N"]:
@@ -158,15 +175,35 @@ class Illumination:
 
     @cached_property
     def azimuth(self) -> float:
-        """Degrees clockwise from the first view's direction from which a sun lights most of what the views show."""
+        """Degrees clockwise from azimuth 0 from which a sun lights most of what the views show."""
+        return self._most_lit([k * 360.0 / _AZIMUTHS for k in range(_AZIMUTHS)])
+
+    @cached_property
+    def noon(self) -> float:
+        """Azimuth of the sun at noon: south or north where these are known, else as `azimuth`. On which side of the
+        equator a scene lies decides, else which of the two lights more.
+        """
+        if self.north is None:
+            return self.azimuth
+        if self.southern is None:
+            return self._most_lit([180.0, 0.0])
+        return 0.0 if self.southern else 180.0
+
+    @property
+    def clockwise(self) -> bool:
+        """The sun goes clockwise in a day, as seen from above: not where it stands in the north at noon."""
+        return self.north is None or self.noon != 0
+
+    def _most_lit(self, azimuths: Sequence[float]) -> float:
+        """The one of some azimuths, the first of equals, from which most of what the views show is lit."""
         some = slice(None, None, max(1, len(self.far) // _TRIED_GAUSSIANS))
         surfaces = Surfaces(*(part[some] for part in self.surfaces))
         weights = torch.where(self.far[some], torch.zeros(()), surfaces.weights)
         points = self.points[some]
         offset = self.offset[some]
-        best = 0.0
+        best = azimuths[0]
         most = -1.0
-        for azimuth in [k * 360.0 / _AZIMUTHS for k in range(_AZIMUTHS)]:
+        for azimuth in azimuths:
             sun = self.sun_direction(azimuth, _TRIED_ELEVATION)
             reach = transport(self.blockers, points, frame_of(sun, self.up), offset, offset, self.blur)
             received = Received(surfaces.normals, surfaces.sure, self.openness[some], reach)
@@ -266,6 +303,8 @@ class Illumination:
         azimuth = 0.0
         if config.place is not None:
             azimuth = config.place[0]
+            if config.sun_from == "view":
+                azimuth += self.view_azimuth
         elif bool(light.sun.any()):
             azimuth = self.azimuth
         sun = self.sun_direction(azimuth, light.elevation)
@@ -463,19 +502,6 @@ def relit_harmonics(
     return recoloured(harmonics, affine_change(gain), weight, all_around(harmonics.shape[1]))
 
 
-def world_axes(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
-    """Up, as cameras are held level, and the level direction of the first view; both of length 1."""
-    right = cameras.pose[:, :, 0].double()
-    # Held level, all have their x axes square to it; of views in one direction their own y axes tell it.
-    above = (cameras.pose[:, :, 1] + 0.5 * cameras.pose[:, :, 2]).double().mean(0)
-    moments = right.T @ right / len(right) - 1e-4 * torch.outer(above, above)
-    up = torch.linalg.eigh(moments)[1][:, 0]
-    up = up * (1.0 if float(up @ above) >= 0 else -1.0)
-    ahead = (cameras.pose[0, :, 1] - cameras.pose[0, :, 2]).double()
-    ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
-    return up.float(), ahead.float()
-
-
 def mixed_gain(
     illumination: Illumination, parts: Sequence[tuple[float, SunConfig | None]]
 ) -> Annotated[Tensor, "N 3"]:
@@ -484,6 +510,35 @@ def mixed_gain(
     for share, config in parts:
         total += share * (1.0 if config is None else illumination.gain(config))
     return total
+
+
+def facing_north(illumination: Illumination, north: North | None) -> Illumination:
+    """An illumination whose azimuths count from north, where that is known."""
+    if north is None:
+        return illumination
+    there = torch.tensor(north.direction)
+    level = there - (there @ illumination.up) * illumination.up
+    if float(level.norm()) < _MIN_LEVEL_NORTH:
+        return illumination
+    level = torch.nn.functional.normalize(level, dim=0)
+    turned = replace(illumination, north=level, southern=north.southern)
+    suns = []
+    for sun in illumination.known_sun:
+        if sun is not None:
+            direction = illumination.sun_direction(sun.azimuth, sun.elevation)
+            sun = sun._replace(azimuth=turned.degrees_of(direction)[0])
+        suns.append(sun)
+    return replace(turned, known_sun=tuple(suns))
+
+
+def azimuth_note(north: North | None, lights: Sequence[SunConfig | None]) -> str:
+    """One line that says what azimuths of suns count from."""
+    if north is None:
+        return "azimuths count from the direction of the first view, as nothing tells where north lies"
+    note = f"azimuths count from north: {north.source}"
+    if any(light is not None and light.place is not None and light.sun_from == "view" for light in lights):
+        return f"{note}; that of --sun from the direction of the first view"
+    return note
 
 
 def captured_light_note(sun: CapturedSun | None, *, unlit: bool) -> str:

@@ -21,6 +21,7 @@ from ..interfaces import Encoder
 from ..io.cache import cache_folder
 from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras, directions_of, intrinsics_of, pixel_grid
+from ..rendering.north import North
 from ..rendering.renderer import enlarged
 from ..scenes import Scene, SceneView, Values
 from ..style.dictionary import Encoders
@@ -34,7 +35,15 @@ from .gaussians import GaussianRows, Gaussians
 from .kept_light import kept_illumination
 from .levels import Levels, StyledLevels
 from .pinholes import camera_of, cover, covering, distorted
-from .relighting import Illumination, captured_light_note, find_illumination, mixed_gain, relit_harmonics
+from .relighting import (
+    Illumination,
+    azimuth_note,
+    captured_light_note,
+    facing_north,
+    find_illumination,
+    mixed_gain,
+    relit_harmonics,
+)
 from .restyle import ColourEncoder, restyled_harmonics
 from .semantics import Semantics
 
@@ -81,6 +90,8 @@ class SplatScene(Scene):
     """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the Gaussians and the views."""
+    north: North | None = None
+    """Where north lies; None where nothing tells it."""
     tones: Tones | None = None
     """Exposures of the views, where a run has learnt them."""
     poses: Callable[[ParsedScene, Sequence[int]], Annotated[Tensor, "V 6"]] | None = None
@@ -168,12 +179,20 @@ class SplatScene(Scene):
 
     @property
     def light_notes(self) -> tuple[str, ...]:
-        """A line about the light of the capture, for a look that changes it."""
+        """A line about the light of the capture, for a look that changes it, and one about azimuths, where some are
+        given or said.
+        """
         look = self.look
         if look is None or not look.lit:
             return ()
         unlit = all(config is None or config.unlit for _, config in look.lights)
-        return (captured_light_note(self.light_found.captured_sun, unlit=unlit),)
+        found = self.light_found
+        sun = found.captured_sun
+        notes = [captured_light_note(sun, unlit=unlit)]
+        configs = [config for _, config in look.lights]
+        if sun is not None or any(config is not None and config.place is not None for config in configs):
+            notes.append(azimuth_note(None if found.north is None else self.north, configs))
+        return tuple(notes)
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""
@@ -347,7 +366,8 @@ class SplatScene(Scene):
 
 def illuminated(scene: SplatScene) -> Illumination:
     """Find surfaces, shadows and sky of a scene for another light, from its views."""
-    return find_illumination(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
+    found = find_illumination(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
+    return facing_north(found, scene.north)
 
 
 def with_illumination(scene: SplatScene, folder: Path | None = None) -> SplatScene:
@@ -357,9 +377,10 @@ def with_illumination(scene: SplatScene, folder: Path | None = None) -> SplatSce
 
     def known() -> Illumination:
         kept_in = folder or cache_folder("light")
-        return kept_illumination(
+        kept = kept_illumination(
             kept_in, scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near
         )
+        return facing_north(kept, scene.north)
 
     return replace(scene, illumination=cache(known))
 

@@ -7,6 +7,7 @@ from typing import Any
 from ..checks import between
 from ..errors import CheckpointError
 from ..plugins.codec import from_json
+from ..rendering.north import North
 from ..rendering.space import Space
 from ..types import Origin
 
@@ -57,6 +58,8 @@ class Facts:
     """World distance that views commonly see: the unit in which cameras are shifted."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the local frame that all of the run is in (see `rendering.local_frame`)."""
+    north: North | None = None
+    """Where north lies, where the capture tells it."""
     field: FieldFacts | None = None
     """Facts of its fields; None where it is made of something else."""
 

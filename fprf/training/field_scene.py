@@ -14,6 +14,7 @@ from ..datamanagers.scene import ParsedScene
 from ..errors import CheckpointError, WeightsError
 from ..interfaces import Decoder
 from ..rendering.cameras import Cameras
+from ..rendering.north import North
 from ..scenes import Scene, Values
 from ..style.dictionary import Encoders
 from ..style.look import Restyle
@@ -62,6 +63,10 @@ class Trained(Scene):
     @property
     def origin(self) -> Origin:
         return self.known.facts.origin
+
+    @property
+    def north(self) -> North | None:
+        return self.known.facts.north
 
     @property
     def device(self) -> torch.device:

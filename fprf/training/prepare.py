@@ -103,6 +103,7 @@ def facts_of(
         else (),
         reach=reach_of(scene, space) if poses else 1.0,
         origin=scene.origin,
+        north=scene.north,
     )
 
 

@@ -191,7 +191,7 @@ def write_scene(folder: Path, points: tuple[float, ...] = (0, 0, 0)) -> Path:
 
 def test_a_scene_without_faults_has_none(tmp_path: Path) -> None:
     found = _by_name(scene_folder(write_scene(tmp_path / "s")))
-    assert set(found) == {"format", "views", "split", "points", "next"}
+    assert set(found) == {"format", "views", "split", "north", "points", "next"}
     assert not any(finding.remedy for finding in found.values())
     assert found["points"].found.startswith("400 ") and "10 of 10" in found["points"].found
 

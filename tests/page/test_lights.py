@@ -40,7 +40,12 @@ def test_a_sun_is_a_part_of_the_look(splats: Session, listener: Listener) -> Non
     splats.handle(1, EVENING)
     listener.until(lambda: bool(heard(listener, "light Now")))
     listener.until(lambda: bool(heard(listener, "colours Now")))
-    assert splats.state.described()["sun"] == {"light": None, "sun": (120.0, 20.0), "strength": 0.8}
+    assert splats.state.described()["sun"] == {
+        "light": None,
+        "sun": (120.0, 20.0),
+        "from": "north",
+        "strength": 0.8,
+    }
     head, parts = unpacked(splats.lights.light("Now"))
     light = packed_light(scene.light_found, CONFIG)  # type: ignore[attr-defined]
     order = splats.packed.order.numpy()

@@ -116,6 +116,11 @@ def test_a_day_goes_from_one_blue_hour_to_the_other_by_way_of_noon() -> None:
     assert heights[:6] == sorted(heights[:6]) and heights == pytest.approx(heights[::-1])
     around = [(each.azimuth - 30 + 180) % 360 - 180 for each in hours]
     assert around == sorted(around), "clockwise"
+    # South of the equator it rises in the east, too, and stands in the north at noon.
+    south = day(9, noon=0.0, clockwise=False)
+    assert south[1].azimuth > 0 > south[-2].azimuth and south[5].azimuth == pytest.approx(0)
+    north = day(9, noon=180.0)
+    assert 0 < north[1].azimuth < 180 and -180 < north[-2].azimuth < 0
 
 
 @pytest.mark.parametrize("count", [-1, 1, 65])

@@ -16,6 +16,7 @@ from fprf.light.config import SunConfig
 from fprf.light.relight import LINEAR_OFFSET, SHOULDER, encoded
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import Cameras
+from fprf.rendering.north import North, world_axes
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
@@ -23,7 +24,7 @@ from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.pinholes import camera_of
-from fprf.splats.relighting import find_illumination, relit_harmonics, world_axes
+from fprf.splats.relighting import facing_north, find_illumination, relit_harmonics
 from fprf.splats.scene import SplatScene, illuminated, with_illumination
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import save_dictionary
@@ -116,6 +117,7 @@ def test_no_strength_is_the_file_bit_for_bit(tmp_path: Path) -> None:
 SECOND: dict[str, object] = {
     "light": "moonlight",
     "sun": (-60.0, 20.0),
+    "sun_from": "view",
     "sun_elevation": 20.0,
     "sun_over_sky": (2.0, 1.0, 0.5),
     "sun_strength": 0.5,
@@ -124,6 +126,56 @@ SECOND: dict[str, object] = {
     "sun_size": 5.0,
     "unlit": True,
 }
+
+
+SOUTH_EAST = -135.0
+"""Azimuth of north from the first view's direction, where that is south-east."""
+
+
+def facing(scene: SplatScene, azimuth: float, southern: bool | None = None) -> SplatScene:
+    """The scene, with north so many degrees clockwise from the direction of its first view."""
+    assert scene.illumination is not None
+    found = scene.illumination()
+    x, y, z = found.sun_direction(azimuth, 20.0).tolist()  # its level part counts
+    north = North(direction=(x, y, z), source="a compass", southern=southern)
+    return replace(scene, north=north, illumination=lambda: facing_north(found, north))
+
+
+def test_azimuths_count_from_north_where_it_is_known(scene: SplatScene) -> None:
+    plain = lit(scene, SunConfig(sun=(-90.0, 35.0)))
+    # What is to the left of the first view, which looks south-east, lies north-east.
+    turned = facing(scene, SOUTH_EAST)
+    assert torch.allclose(lit(turned, SunConfig(sun=(45.0, 35.0))).light_gain, plain.light_gain, atol=1e-4)
+    by_view = lit(turned, SunConfig(sun=(-90.0, 35.0), sun_from="view"))
+    assert torch.allclose(by_view.light_gain, plain.light_gain, atol=1e-4)
+    assert "first view" in plain.light_notes[1] and "a compass" in by_view.light_notes[1]
+    assert "first view" in by_view.light_notes[1]
+    known = turned.light_found
+    assert known.view_azimuth == pytest.approx(-SOUTH_EAST, abs=1e-3)
+    assert scene.light_found.view_azimuth == pytest.approx(0, abs=1e-3)
+    # A captured sun that was found before stands where it stood.
+    sunny = in_the_sun(scene, (60.0, 35.0)).light_found
+    sunny = replace(sunny, known_sun=(sunny.captured_sun,))
+    assert turned.north is not None
+    there = facing_north(sunny, turned.north)
+    before = sunny.captured_sun
+    after = there.captured_sun
+    assert before is not None and after is not None and after.azimuth != before.azimuth
+    place = sunny.sun_direction(before.azimuth, before.elevation)
+    assert torch.allclose(there.sun_direction(after.azimuth, after.elevation), place, atol=1e-5)
+
+
+def test_the_sun_stands_in_the_south_at_noon_or_south_of_the_equator_in_the_north(scene: SplatScene) -> None:
+    north = facing(scene, 30.0, southern=False).light_found
+    south = facing(scene, 30.0, southern=True).light_found
+    assert (north.noon, north.clockwise, south.noon, south.clockwise) == (180.0, True, 0.0, False)
+    # Where only the direction is known it is the side that lights more.
+    unknown = facing(scene, 30.0).light_found
+    assert unknown.noon in (0.0, 180.0) and unknown.clockwise == (unknown.noon == 180.0)
+    assert scene.light_found.noon == scene.light_found.azimuth and scene.light_found.clockwise
+    # A direction that points up is none.
+    x, y, z = scene.light_found.up.tolist()
+    assert facing_north(scene.light_found, North(direction=(x, y, z))).north is None
 
 
 def in_the_sun(scene: SplatScene, sun: tuple[float, float]) -> SplatScene:
@@ -162,6 +214,8 @@ def test_a_second_value_changes_the_light(scene: SplatScene, name: str) -> None:
     noon = NOON
     if name == "sun_elevation":
         noon = SunConfig(light="noon")
+    if name == "sun_from":
+        scene = facing(scene, SOUTH_EAST)
     other = replace(noon, **{name: SECOND[name]})  # type: ignore[arg-type]
     assert float((lit(scene, other).light_gain - lit(scene, noon).light_gain).abs().max()) > 1e-3
 

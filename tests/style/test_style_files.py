@@ -59,6 +59,7 @@ def full(folder: Path) -> StyleFile:
         at=0.75,
         light="golden-hour",
         sun=(30.0, 12.5),
+        sun_from="view",
         sun_elevation=14.0,
         sun_over_sky=(4.0, 3.0, 2.0),
         sun_strength=0.5,

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...rendering.cameras import Cameras
+from ...rendering.north import North
 from ..images import ImageHeader, has_transparency, read_header
 from ..masks import SKY, USED, FoundMasks, MaskKind, masks_beside
 from ..photograph_files import COPIES, left_out_note, pixel_digest
@@ -50,6 +51,8 @@ class CaptureContents:
     """Pairs [O 2] of a view and a point that it shows."""
     reduced: bool = False
     """Images are copies, of one shape with the cameras, that may each be reduced by a factor of its own."""
+    north: North | None = None
+    """Where north lies, where the capture says so."""
     notes: Sequence[str] = ()
     """Decisions that were taken while it was read."""
 
@@ -103,6 +106,7 @@ def assemble_scene(data: Path, contents: CaptureContents, *, downscale: float) -
         masks=used.masks,
         sky_masks=sky.masks,
         alpha=_is_transparent(views, headers),
+        north=contents.north,
         notes=(*contents.notes, *scaling, *used.notes, *sky.notes),
     )
 

@@ -388,7 +388,8 @@ def parse_scene(data: Path, downscale: float, parser: DataParserConfig | None) -
     Where the capture lies far from 0 the scene is in a local frame, whatever the parser
     (`ParsedScene.origin`).
     """
+    from ..positions import with_north
     from ..scene import in_local_frame
 
     chosen = recognise(data) if parser is None else parser
-    return in_local_frame(chosen.build().parse(data, downscale))
+    return with_north(in_local_frame(chosen.build().parse(data, downscale)))

@@ -4,8 +4,9 @@
 OpenSfM's coordinates on the image plane have their origin in the middle and the larger side as their unit, so
 they hold for images of any size. A shot's `rotation` (axis times angle) and, in a reconstruction,
 `translation` take the world to the camera, whose x is right, y down and z forward. In shots.geojson
-`translation` is the camera's place in projected metres. Frames are kept. Of several reconstructions that of
-most shots is read. WebODM's download leaves the photographs out: put them in `images`.
+`translation` is the camera's place in projected metres. Frames are kept: x points east and y north, to two
+degrees, in a report and in a reconstruction whose `reference_lla` says where on the earth its origin lies. Of several
+reconstructions that of most shots is read. WebODM's download leaves the photographs out: put them in `images`.
 """
 
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
+from ...rendering.north import North
 from ..scene import ParsedScene
 from .assembly import CaptureContents, assemble_scene
 from .config import ODM_FILES, OdmConfig, project_file
@@ -58,8 +60,9 @@ class OdmParser(DataParser):
             raise DataError(f"{data}: neither {' nor '.join(ODM_FILES)}; give the folder of an ODM project")
         # A whole project brings points; a report has poses alone.
         points = None
+        north: North | None = _north("the shots of an ODM report are in projected metres", None)
         if file.name == "reconstruction.json":
-            shots, points = _reconstruction(file)
+            shots, points, north = _reconstruction(file)
         else:
             shots = _shots(data, file)
         folder, said = image_folder(path_inside(data, "parser.images", self.config.images)[1])
@@ -68,12 +71,17 @@ class OdmParser(DataParser):
             ((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0]
         )
         views, _, lost = read_views(data, named, lambda each: _view(str(file), *each))
-        contents = CaptureContents(views=views, points=points, notes=(*said, *lost))
+        contents = CaptureContents(views=views, points=points, north=north, notes=(*said, *lost))
         return assemble_scene(data, contents, downscale=downscale)
 
 
-def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
-    """Shots and points of the largest part."""
+def _north(says: str, latitude: float | None) -> North:
+    southern = None if latitude is None else latitude < 0
+    return North(direction=(0.0, 1.0, 0.0), source=f"+y, as {says}", southern=southern)
+
+
+def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64], North | None]:
+    """Shots, points and north of the largest part."""
     whole = read_json(file)
     parts = []
     if isinstance(whole, list):
@@ -95,7 +103,19 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
     for point in _objects(largest, "points").values():
         points.append(point.numbers("coordinates", 3))
     cloud = np.array(points).reshape(-1, 3)
-    return shots, cloud[np.isfinite(cloud).all(1)]
+    return shots, cloud[np.isfinite(cloud).all(1)], _north_of(largest)
+
+
+def _north_of(part: Record) -> North | None:
+    """North of a reconstruction, whose reference is 0 where no photograph had a position."""
+    if part.get("reference_lla") is None:
+        return None
+    reference = as_record(f"{part.where}: reference_lla", part.get("reference_lla"))
+    latitude = reference.number("latitude") or 0.0
+    longitude = reference.number("longitude") or 0.0
+    if not (abs(latitude) < 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
+        return None
+    return _north("its reference_lla says", latitude)
 
 
 def _shots(data: Path, file: Path) -> list[_Shot]:

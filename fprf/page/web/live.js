@@ -22,7 +22,7 @@ const CHANGES = ["set", "preset", "card", "map", "region", "undo", "sun"];
  * @typedef {{action: string, card: number?}} Rule
  * @typedef {{region: number, share: number, taken: {name: string, share: number}[], rules: Rule[]}} PickedRegion
  * @typedef {{done: number, total: number, ready: boolean}} FilmState
- * @typedef {{light: string?, sun: [number, number]?, strength: number}} SunState
+ * @typedef {{light: string?, sun: [number, number]?, from: string, strength: number}} SunState
  * @typedef {{shelf: ShelfRow[], look: Object<string, number>, map: string, picked: PickedRegion?, kept: string[],
  *   keys: CameraMessage[], film: FilmState, defaults: Object<string, number>, undo: boolean, redo: boolean,
  *   keeps: string, sun: SunState}} SharedState
@@ -148,7 +148,7 @@ class Live {
       case "state":
         this.state = message;
         this.panel.fill(message);
-        this.sun?.fill(message.sun);
+        this.sun?.fill();
         break;
     }
   }

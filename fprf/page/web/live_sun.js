@@ -17,6 +17,8 @@ class LiveSun {
     this.moving = false;
     /** @type {SunState?} the light that was asked for and has not come */
     this.wanted = null;
+    // Azimuth of the first view's direction.
+    this.first = 0;
     /** @type {number?} where the slider of the time was last */
     this.hour = null;
     // When the last wish was sent, and how long its light took to be shown.
@@ -37,16 +39,17 @@ class LiveSun {
 
   async fetched() {
     const { head, parts } = await unpacked(await asked("/surfaces"));
+    this.first = head.first;
     const planes = await inflate(parts.planes);
     const count = planes.length / 2;
     if (!this.panel) {
-      this.panel = new SunPanel(this.live.place, { ahead: head.ahead, day: head.day, along: false }, {
+      this.panel = new SunPanel(this.live.place, { ahead: head.ahead, north: head.north, day: head.day, along: false }, {
         move: (sun, moving) => this.wish({ light: this.named === "moonlight" ? "moonlight" : null, sun }, moving),
         time: (hour, moving) => this.time(hour, moving),
         strengthen: (strength, moving) => this.wish({ strength }, moving),
         name: (name) => this.wish({ light: name === "captured" ? null : name, sun: null }, false),
       });
-      this.fill(this.light);
+      this.fill();
     }
     return { level: planes.subarray(0, count), open: planes.subarray(count), head };
   }
@@ -56,9 +59,12 @@ class LiveSun {
     this.load().catch((error) => say(error.message, true));
   }
 
-  /** The light of the state. @returns {SunState} */
+  /** The light of the state, its sun as the panel counts azimuths. @returns {SunState} */
   get light() {
-    return this.live.state?.sun ?? { light: null, sun: null, strength: 1 };
+    const light = this.live.state?.sun ?? { light: null, sun: null, from: "north", strength: 1 };
+    if (!light.sun || light.from !== "view") return light;
+    const [azimuth, elevation] = light.sun;
+    return { ...light, sun: [(azimuth + this.first + 540) % 360 - 180, elevation], from: "north" };
   }
 
   get named() {
@@ -91,11 +97,11 @@ class LiveSun {
     }
   }
 
-  /** Show the light of a state, unless somebody is changing it. @param {SunState} light */
-  fill(light) {
+  /** Show the light of the state, unless somebody is changing it. */
+  fill() {
     if (this.moving) return;
     this.wanted = null;
-    if (this.panel) this.show(light);
+    if (this.panel) this.show(this.light);
   }
 
   /**

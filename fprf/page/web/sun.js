@@ -5,6 +5,7 @@ const SUN_STEP = 5; // degrees by which an arrow key moves the sun; by eye
 const HOUR_STEP = 0.25; // hours, where the sun goes along a day
 const LEAST_ELEVATION = 0.5; // degrees, as `SunConfig` takes them
 const DOME_RADIUS = 92; // of the horizon on the dome, whose box is 200 wide
+const NORTH_RADIUS = 80; // of the letter of north, within the horizon
 const NEAREST_STEPS = 240; // that a day is divided into, to find the time of a place
 const SRGB_OFFSET = 0.055; // IEC 61966-2-1, also that of gains
 
@@ -17,9 +18,11 @@ const SRGB_OFFSET = 0.055; // IEC 61966-2-1, also that of gains
  *
  * Bytes of the Gaussians whatever the light, and constants of its formulas.
  * @typedef {{level: Uint8Array, open: Uint8Array, head: SurfaceHead}} LitSurfaces
- * @typedef {{ahead: Vector, fit: ?number[][], shoulder: number, albedo: number, most: number, mostSky: number, leastSky: number, leastBlue: number, mostHue: number}} SurfaceHead
+ * @typedef {{ahead: Vector, north: boolean, first: number, fit: ?number[][], shoulder: number, albedo: number, most: number, mostSky: number, leastSky: number, leastBlue: number, mostHue: number}} SurfaceHead
  *
- * Azimuth, clockwise from the direction of the first view, and elevation of a sun in degrees.
+ * `ahead` is the direction of azimuth 0: north, or where that is not known the first view's; `first` the azimuth of the latter.
+ *
+ * Azimuth, clockwise from there, and elevation of a sun in degrees.
  * @typedef {[number, number]} SunPlace
  *
  * A time of a day in hours, and where the sun stands then.
@@ -213,12 +216,13 @@ const number = (slider, text) => {
 class SunPanel {
   /**
    * @param {Place} place
-   * @param {{ahead: Vector, day: DayTime[], along: boolean}} about `along`: the sun stays on the day's way
+   * @param {{ahead: Vector, north: boolean, day: DayTime[], along: boolean}} about `along`: the sun stays on the day's way
    * @param {LightWishes} on
    */
-  constructor(place, { ahead, day, along }, on) {
+  constructor(place, { ahead, north, day, along }, on) {
     this.place = place;
     this.ahead = ahead;
+    this.north = north;
     this.day = day;
     this.along = along;
     this.on = on;
@@ -285,7 +289,7 @@ class SunPanel {
     else this.on.move(tenths(wanted), moving);
   }
 
-  /** Degrees clockwise from the first view's direction to that in which one looks. */
+  /** Azimuth of the direction in which one looks. */
   headed() {
     const { camera, scene } = this.place;
     const right = cross(this.ahead, scene.up);
@@ -308,7 +312,17 @@ class SunPanel {
       if (sun[1] >= 0) points.push(this.spot(sun).join(","));
     }
     at("day").setAttribute("points", points.join(" "));
+    if (this.north) this.mark();
     this.show({});
+  }
+
+  /** Mark north on the dome's rim. */
+  mark() {
+    const letter = at("north");
+    const turned = -(this.heading ?? 0) * Math.PI / 180;
+    letter.textContent = "N";
+    letter.setAttribute("x", (NORTH_RADIUS * Math.sin(turned)).toFixed(1));
+    letter.setAttribute("y", (-NORTH_RADIUS * Math.cos(turned)).toFixed(1));
   }
 
   /** Place of a sun in the dome's box, -100 to 100. @param {SunPlace} place */
@@ -330,7 +344,7 @@ class SunPanel {
     handle.style.top = `${50 + y / 2}%`;
     handle.classList.toggle("off", !sun);
     handle.setAttribute("aria-valuenow", String(Math.round(sun?.[0] ?? 0)));
-    handle.setAttribute("aria-valuetext", sun ? `${Math.round(sun[0])}° clockwise from the first view, ${Math.round(sun[1])}° above the horizon` : "no sun");
+    handle.setAttribute("aria-valuetext", sun ? `${Math.round(sun[0])}° clockwise from ${this.north ? "north" : "the first view"}, ${Math.round(sun[1])}° above the horizon` : "no sun");
     at("hour").value = String(hour ?? 12);
     at("hour").setAttribute("aria-valuetext", hour === null ? "no time" : clock(hour));
     number(at("hour"), hour === null ? "" : clock(hour));
@@ -364,7 +378,7 @@ class Daylight {
     this.surfaces = { level: plane(0), open: plane(1), head };
     let planes = 2;
     this.met = head.day.map((each) => (each.met ? plane(planes++) : null));
-    this.panel = new SunPanel(place, { ahead: head.ahead, day: head.day, along: true }, {
+    this.panel = new SunPanel(place, { ahead: head.ahead, north: head.north, day: head.day, along: true }, {
       move: () => undefined, // along the day's way it goes by its time
       time: (hour) => this.set({ name: "", hour }),
       strengthen: (strength) => this.set({ strength }),

@@ -27,6 +27,7 @@ from ...plugins.captures import CAPTURES, endings, format_name
 from ...plugins.config import PluginConfig
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
+from ...rendering.north import North
 from ...types import Origin
 from ..activation import Activation
 from ..gaussians import GaussianRows, Gaussians, bulk_of, from_arrays, morton_order
@@ -75,6 +76,8 @@ class Capture:
     """Direction that points up, where the file says so, or its format."""
     up_reason: str = ""
     """Source of that, as a phrase."""
+    north: North | None = None
+    """Where north lies, where the file says so."""
     camera: Cameras | None = None
     """The view that the capture was made from, where the file holds it."""
     shift: Origin = (0.0, 0.0, 0.0)
