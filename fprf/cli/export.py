@@ -265,8 +265,11 @@ class _Export:
 
     def _fitted(self) -> Iterator["GaussianRows"]:
         from ..export.fit import Limits, fit_gaussians
+        from ..rendering.north import bearings_of
         from ..splats.gaussians import GaussianRows
 
+        scene = self.opened.scene
+        bearings = bearings_of(scene.cameras, scene.north)
         limits = Limits(
             minutes=self.config.fit or FIT_MINUTES,
             cap=self.config.fit_cap,
@@ -275,10 +278,8 @@ class _Export:
         looks = []
         for look in self.looks:
             looks.append(look.restyle)
-        fitted = fit_gaussians(
-            self.opened.scene, self.views, self.plain, looks, limits, report=self.display.count
-        )
-        return (GaussianRows(len(gaussians), gaussians.select, True) for gaussians in fitted)
+        fitted = fit_gaussians(scene, self.views, self.plain, looks, limits, report=self.display.count)
+        return (GaussianRows(len(gaussians), gaussians.select, True, bearings) for gaussians in fitted)
 
     def meshes(self) -> dict[str, Any]:
         """One mesh of the scene as it is, in the colours of each look."""

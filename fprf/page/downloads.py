@@ -4,8 +4,9 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from ..rendering.north import bearings_of
 from ..splats.files import Capture, write_capture, write_gaussians
-from ..splats.gaussians import Gaussians
+from ..splats.gaussians import GaussianRows, Gaussians
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig, find_reference, parse_region_value
 from ..style.files import StyleFile, write_style
@@ -21,9 +22,9 @@ def write_shown(path: Path, scene: SplatScene, capture: Capture | None, gaussian
     if capture is not None:
         write_capture(path, capture, gaussians.harmonics, scene.views)
         return
-    write_gaussians(
-        path, gaussians, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin
-    )
+    bearings = bearings_of(scene.views, scene.north)
+    rows = GaussianRows(len(gaussians), gaussians.select, scene.antialiased, bearings)
+    write_gaussians(path, rows, views=scene.views, plain=True, origin=scene.origin)
 
 
 def write_style_of(path: Path, look: Look, file: StyleFile) -> None:

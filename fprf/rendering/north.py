@@ -56,6 +56,14 @@ class North:
     """The scene lies south of the equator; None = not known."""
 
 
+class Bearings(NamedTuple):
+    """What a file of Gaussians says of the directions of its world."""
+
+    north: tuple[float, float, float]
+    up: tuple[float, float, float] | None
+    """None = not known."""
+
+
 class NorthFit(NamedTuple):
     """North as positions on the earth tell it."""
 
@@ -80,6 +88,14 @@ def world_axes(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], Annotated[Tens
     ahead = (cameras.pose[0, :, 1] - cameras.pose[0, :, 2]).double()
     ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
     return up.float(), ahead.float()
+
+
+def bearings_of(cameras: Cameras, north: North | None) -> Bearings | None:
+    """Bearings of a scene that cameras see; None where nothing tells its north."""
+    if north is None:
+        return None
+    x, y, z = world_axes(cameras)[0].tolist()
+    return Bearings(north.direction, (x, y, z))
 
 
 def metres_from(

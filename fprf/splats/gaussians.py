@@ -17,6 +17,7 @@ from torch import Tensor
 from ..errors import CheckpointError, DataError
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise.training import HARMONICS, LOG_SCALES, LOGIT, MEANS, QUATERNION
+from ..rendering.north import Bearings
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
@@ -171,6 +172,8 @@ class GaussianRows:
     part: Callable[[slice], Gaussians]
     antialiased: bool
     """Opacities are compensated for the width that drawing adds (Mip-Splatting)."""
+    bearings: Bearings | None = None
+    """Where north and up are, for a file to say; None where nothing tells it."""
 
 
 def from_arrays(

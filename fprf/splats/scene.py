@@ -21,7 +21,7 @@ from ..interfaces import Encoder
 from ..io.cache import cache_folder
 from ..ops.rasterise.gsplat import usable
 from ..rendering.cameras import Cameras, directions_of, intrinsics_of, pixel_grid
-from ..rendering.north import North
+from ..rendering.north import North, bearings_of
 from ..rendering.renderer import enlarged
 from ..scenes import Scene, SceneView, Values
 from ..style.dictionary import Encoders
@@ -196,7 +196,8 @@ class SplatScene(Scene):
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""
-        return GaussianRows(len(self.gaussians), self.part, self.antialiased)
+        bearings = bearings_of(self.views, self.north)
+        return GaussianRows(len(self.gaussians), self.part, self.antialiased, bearings)
 
     @cached_property
     def _detail(self) -> Levels | StyledLevels:

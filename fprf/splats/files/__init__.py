@@ -15,6 +15,7 @@ from torch import Tensor
 from ...errors import DataError
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import added_and_beside, read_offset, write_offset
+from ...rendering.north import Bearings
 from ...types import Origin
 from ..activation import activated as with_activated
 from ..activation import file_harmonics, find_activation
@@ -158,13 +159,15 @@ def write_gaussians(
     such opacities, for renderers that do not compensate. Where the Gaussians' `origin` is not 0, .ply holds
     float64 positions in the world; the others, and .ply where `local`, hold those relative to the origin,
     with a file beside them that says so. Of rows that are written as .ply, not `plain`, some at a time are in
-    memory; they say themselves whether they are `antialiased`.
+    memory; they say themselves whether they are `antialiased`, and where north is, which the file then says, too.
     """
     form = format_of(path)
+    bearings = None
     added, beside = added_and_beside(origin, local or not form.exact)
     if isinstance(gaussians, GaussianRows):
+        bearings = gaussians.bearings
         if form.exact and form.view_dependent and not plain:
-            form.write(path, form.pack_rows(gaussians, added))
+            form.write(path, _told(form, form.pack_rows(gaussians, added), bearings))
             write_offset(path, beside)
             return Written()
         antialiased = gaussians.antialiased
@@ -182,9 +185,14 @@ def write_gaussians(
             gaussians = seen.plain(gaussians)
         antialiased = False
     # The offset comes last, so that a file that cannot be written leaves the one before it in its place.
-    form.write(path, form.pack(gaussians, antialiased, added))
+    form.write(path, _told(form, form.pack(gaussians, antialiased, added), bearings))
     write_offset(path, beside)
     return Written(held.faulty, held.far, tuple(form.notes(gaussians)))
+
+
+def _told(form: CaptureFormat, pieces: Iterable[bytes], bearings: Bearings | None) -> Iterable[bytes]:
+    """A file that also says where north is, where that is known."""
+    return pieces if bearings is None else form.with_bearings(pieces, bearings)
 
 
 class _Held(NamedTuple):
@@ -232,9 +240,11 @@ def write_capture(
         harmonics = before.index_copy(0, finite.nonzero()[:, 0], harmonics)
     if not form.holds(capture, format_of(capture.path)):
         drawn = capture.gaussians.recoloured(harmonics).select(finite)
-        written = write_gaussians(
-            path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin
-        )
+        bearings = None
+        if capture.north is not None:
+            bearings = Bearings(capture.north.direction, capture.up)
+        rows = GaussianRows(len(drawn), drawn.select, capture.antialiased, bearings)
+        written = write_gaussians(path, rows, views=views, origin=capture.origin)
         return written._replace(faulty=not bool(finite.all()))
     changed = _changed(before, harmonics)
     if bool(changed.any()):

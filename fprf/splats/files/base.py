@@ -11,7 +11,7 @@ A reader never allocates on a file's word: what a header claims is held against 
 import mmap
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
@@ -27,7 +27,7 @@ from ...plugins.captures import CAPTURES, endings, format_name
 from ...plugins.config import PluginConfig
 from ...rendering.cameras import Cameras
 from ...rendering.local_frame import local_origin
-from ...rendering.north import North
+from ...rendering.north import Bearings, North
 from ...types import Origin
 from ..activation import Activation
 from ..gaussians import GaussianRows, Gaussians, bulk_of, from_arrays, morton_order
@@ -42,6 +42,8 @@ ROWS = 1 << 17
 """Gaussians that are decoded or encoded at a time, so that the intermediate arrays of large files stay
 small.
 """
+OWN_KEY = "fprf"
+"""Key of what fprf adds to documents of formats that have no place for it: where north and up are."""
 UNSOUND = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError, struct.error)
 """Errors that a document raises, as it is taken apart, that is no valid index of a format."""
 _MIN_OPACITY_MARGIN = 1e-6
@@ -137,6 +139,12 @@ class CaptureFormat(PluginConfig):
     def pack_rows(self, rows: GaussianRows, origin: Origin) -> Iterable[bytes]:
         """`pack` of Gaussians that need not all be in memory."""
         return self.pack(rows.part(slice(0, rows.count)), rows.antialiased, origin)
+
+    def with_bearings(self, pieces: Iterable[bytes], bearings: Bearings) -> Iterable[bytes]:
+        """A file as `pack` gave it that also says where north and up are; as it is where the format has no place for
+        that. `read` returns them.
+        """
+        return pieces
 
     def keeps(self, gaussians: Gaussians) -> NDArray[np.bool_] | None:
         """Gaussians [N] that a file holds: all but outliers that would cost the others their precision; None
@@ -236,6 +244,31 @@ def beside(path: Path, name: str) -> bytes:
         return file.read_bytes()
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
+
+
+def direction_of(numbers: object) -> tuple[float, float, float] | None:
+    """A direction of length 1 that a file names by three numbers; None for what is none."""
+    try:
+        vector = np.array(numbers, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not np.abs(vector).max() > 0:
+        return None
+    vector = vector / np.abs(vector).max()
+    x, y, z = (vector / np.linalg.norm(vector)).tolist()
+    return x, y, z
+
+
+def with_said_bearings(capture: Capture, north: object, up: object) -> Capture:
+    """A capture with the directions that its file names, each by three numbers."""
+    there = direction_of(north)
+    if there is None:
+        return capture
+    above = direction_of(up)
+    reason = "" if above is None else "the file says so"
+    return replace(
+        capture, north=North(direction=there, source="the file says so"), up=above, up_reason=reason
+    )
 
 
 def release(data: Data) -> None:

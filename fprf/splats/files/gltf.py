@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...io.images import srgb_to_linear
+from ...rendering.north import Bearings
 from ...rendering.splines import quaternions, rotations
 from ...types import Origin
 from ..activation import TYPICAL_LN_SIZE, nearest_distance
@@ -191,7 +192,8 @@ class Gltf(CaptureFormat):
             kind = "logarithms, as in the review draft"
         compensated = parts[0].extension.get("extras") == {"antialiased": True}
         notes = (f"sizes are {kind} of {_EXTENSION_NAME}: {reason}",)
-        return Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=notes)
+        capture = Capture(path, gaussians, compensated, data, recolour, shift=shift, notes=notes)
+        return _with_bearings_of(document, capture)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """A .glb of one node; harmonics of degree 4 are left out."""
@@ -238,6 +240,13 @@ class Gltf(CaptureFormat):
             "buffers": [{"byteLength": size}],
         }
         return _glb(document, [values.tobytes() for values in columns.values()])
+
+    def with_bearings(self, pieces: Iterable[bytes], bearings: Bearings) -> list[bytes]:
+        """With extras of the node, in its axes."""
+        _, text, _, *body = pieces
+        document = json.loads(text)
+        document["nodes"][0]["extras"] = {base.OWN_KEY: bearings._asdict()}
+        return _glb(document, body)
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """A .glb; for a .gltf its document, with the buffer as base64."""
@@ -366,6 +375,20 @@ def _shown_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Flo
         for child in node.get("children", []):
             waiting.append((child, matrix))
         yield node, matrix
+
+
+def _with_bearings_of(document: dict[str, Any], capture: Capture) -> Capture:
+    """A capture with the directions that a node of its document names."""
+    for node, matrix in _shown_nodes(document):
+        extras = node.get("extras")
+        said = extras.get(base.OWN_KEY) if isinstance(extras, dict) else None
+        if isinstance(said, dict):
+            turned = []
+            for name in ("north", "up"):
+                direction = base.direction_of(said.get(name))
+                turned.append(None if direction is None else matrix[:3, :3] @ direction)
+            return base.with_said_bearings(capture, *turned)
+    return capture
 
 
 def _matrix_of(node: dict[str, Any]) -> Floats:

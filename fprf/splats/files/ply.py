@@ -4,7 +4,8 @@
 INRIA       float32 x y z, f_dc_0..2, f_rest_* channel by channel, opacity (logit), scale_0..2 (ln), rot_0..3 (w x y z), and
             any other property and element, which are kept. Header comments: `SplatRenderMode:
             default|mip|2dgs`, `antialiased 0|1` (Postshot) and `Vertical axis: x|y|z|X Y Z`, whose letters
-            mean +x, -y and -z in Brush's files and +z in Nerfstudio's, which all say z. Elements
+            mean +x, -y and -z in Brush's files and +z in Nerfstudio's, which all say z; fprf adds
+            `North: X Y Z`. Elements
             `extrinsic`, `intrinsic` and `image_size`: the camera of the one photograph that a capture was
             made of (SHARP). Variants: red green blue as bytes in the place of f_dc (Nerfstudio), no scale_2
             (2D Gaussians), either byte order, ASCII.
@@ -22,15 +23,27 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...rendering.cameras import Cameras, ideal_cameras
+from ...rendering.north import Bearings, North
 from ...types import Origin
 from ..gaussians import COUNTS, GaussianRows, Gaussians
 from ..ground import Direction, axis_name, find_ground
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
 from .ply_chunks import chunk_tables, flat_harmonics, is_chunked, kept_by_chunks, read_chunks
-from .ply_tables import BYTE_ORDER_MARK, Element, Header, ply_file, ply_head, read_header, read_tables
+from .ply_tables import (
+    BYTE_ORDER_MARK,
+    Element,
+    Header,
+    ply_file,
+    ply_head,
+    read_header,
+    read_tables,
+    with_comments,
+)
 
-_MEANINGFUL_COMMENT = re.compile(r"(splatrendermode|antialiased|vertical axis)\b[\s:=]*(.*)", re.IGNORECASE)
+_MEANINGFUL_COMMENT = re.compile(
+    r"(splatrendermode|antialiased|vertical axis|north)\b[\s:=]*(.*)", re.IGNORECASE
+)
 """Comments that say something of a capture, with what they say."""
 _NERFSTUDIO = re.compile(r"\bner(f)?studio\b", re.IGNORECASE)
 """Its exporter calls itself Nerstudio, and writes `Vertical Axis: z` whatever the scene is."""
@@ -75,7 +88,11 @@ class Ply(CaptureFormat):
         if up is None and camera is not None:
             up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
             reason = "so it was for the camera of the photograph that it was made of"
-        return replace(capture, antialiased=said.antialiased, up=up, up_reason=reason, camera=camera)
+        north = None
+        if (there := base.direction_of(_numbers(said.north))) is not None:
+            north = North(direction=there, source=f"its comment says `North: {said.north}`")
+        capture = replace(capture, antialiased=said.antialiased, north=north, camera=camera)
+        return replace(capture, up=up, up_reason=reason)
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> Iterable[bytes]:
         """Exact; with an origin positions are in the world, float64."""
@@ -86,6 +103,13 @@ class Ply(CaptureFormat):
         yield ply_head({"vertex": ply_rows(rows.part(slice(0, 1)), origin)}, rows.antialiased, rows.count)
         for some in base.pieces(rows.count):
             yield ply_rows(rows.part(some), origin).tobytes()
+
+    def with_bearings(self, pieces: Iterable[bytes], bearings: Bearings) -> Iterator[bytes]:
+        """With comments."""
+        comments = [f"North: {_written(bearings.north)}"]
+        if bearings.up is not None:
+            comments.append(f"Vertical axis: {_written(bearings.up)}")
+        return with_comments(pieces, comments)
 
     def holds(self, capture: Capture, read_as: CaptureFormat) -> bool:
         """A compressed file may be called .ply: under the same ending it stays what it is."""
@@ -135,6 +159,8 @@ class _Comments(NamedTuple):
     """Meaning of opacities; of several lines the last one counts."""
     vertical: str
     """The vertical axis; empty where no line says it."""
+    north: str
+    """Where north is; empty where no line says it."""
     nerfstudio: bool
     brush: bool
 
@@ -145,17 +171,20 @@ class _Comments(NamedTuple):
             texts.append(" ".join(words[1:]))
         mode = ""
         vertical = ""
+        north = ""
         for text in texts:
             found = _MEANINGFUL_COMMENT.match(text)
             if found is None:
                 continue
             if found[1].lower() == "vertical axis":
                 vertical = found[2].lower()
+            elif found[1].lower() == "north":
+                north = found[2]
             else:
                 mode = found[2].lower()
         nerfstudio = any(_NERFSTUDIO.search(text) for text in texts)
         brush = any(_BRUSH.search(text) for text in texts)
-        return cls(mode, vertical, nerfstudio, brush)
+        return cls(mode, vertical, north, nerfstudio, brush)
 
     @property
     def antialiased(self) -> bool:
@@ -165,7 +194,7 @@ class _Comments(NamedTuple):
         """The direction up and what tells it: of a letter without a sign the program that wrote it, else the
         ground. None where no line says it.
         """
-        numbers = self.vertical.replace(",", " ").strip("[]() ").split()
+        numbers = _numbers(self.vertical)
         letter = numbers[0] if len(numbers) == 1 else ""
         said = f"its comment says `Vertical axis: {self.vertical}`"
         if letter.lstrip("+-") in _BRUSH_UP and letter not in _BRUSH_UP:
@@ -189,6 +218,16 @@ class _Comments(NamedTuple):
         if not 0 < x * x + y * y + z * z < np.inf:
             return None, ""
         return (x, y, z), said
+
+
+def _numbers(text: str) -> list[str]:
+    """Words of a comment, with or without commas and brackets."""
+    return text.replace(",", " ").strip("[]() ").split()
+
+
+def _written(direction: Direction) -> str:
+    """Three numbers as a comment has them."""
+    return " ".join(f"{number:.7g}" for number in direction)
 
 
 def _along(letter: str, sign: float) -> Direction:

@@ -5,7 +5,7 @@ properties, nor colours without alpha.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -175,6 +175,17 @@ def ply_head(
                 words = ["list", *(_WORD_OF_DTYPE[kind[part].base.str[1:]] for part in kind.names)]
             lines.append(f"property {' '.join(words)} {field}")
     return "\n".join([*lines, "end_header", ""]).encode("latin-1")  # as headers are read
+
+
+def with_comments(pieces: Iterable[bytes], comments: Sequence[str]) -> Iterator[bytes]:
+    """Pieces of a file of `ply_file` or `ply_head` with further lines of comments."""
+    lines = "".join(f"comment {text}\n" for text in comments).encode("latin-1")
+    start = len(ply_head({}, False)) - len("end_header\n")
+    for number, piece in enumerate(pieces):
+        if number == 0:
+            yield piece[:start] + lines + piece[start:]
+        else:
+            yield piece
 
 
 class _Declared(NamedTuple):

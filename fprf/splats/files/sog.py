@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ...datamanagers.images import header_of
 from ...errors import DataError
 from ...io.atomic import atomic_path
+from ...rendering.north import Bearings
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians
 from . import base
@@ -91,7 +92,11 @@ class Sog(CaptureFormat):
             return [bundle(files | new, like=data)]
 
         gaussians, shift = base.decoded(rows.bands, (rows.count, rows.decoded))
-        return Capture(path, gaussians, rows.antialiased, data, recolour, shift=shift)
+        capture = Capture(path, gaussians, rows.antialiased, data, recolour, shift=shift)
+        said = read_meta(path, parts["meta.json"]).get(base.OWN_KEY)
+        if not isinstance(said, dict):
+            return capture
+        return base.with_said_bearings(capture, said.get("north"), said.get("up"))
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """All but outliers that would cost the others their 16 bits."""
@@ -140,6 +145,14 @@ class Sog(CaptureFormat):
         for name, picture in pictures.items():
             parts[name] = lossless_webp(picture)
         return [bundle(parts | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()})]
+
+    def with_bearings(self, pieces: Iterable[bytes], bearings: Bearings) -> list[bytes]:
+        """With a key of its own in meta.json."""
+        data = b"".join(pieces)
+        files = unbundle(Path("meta.json"), data)
+        meta = json.loads(files["meta.json"]) | {base.OWN_KEY: bearings._asdict()}
+        files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
+        return [bundle(files)]
 
     def write(self, path: Path, pieces: Iterable[bytes]) -> None:
         """An archive; of a meta.json its files, into the same folder: while images are replaced it has no

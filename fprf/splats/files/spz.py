@@ -15,7 +15,7 @@ are kept.
 import itertools
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -24,11 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...rendering.north import Bearings
 from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
 from . import base
 from .base import Bools, Capture, CaptureFormat, Data, Floats
-from .spz_axes import PLY_AXES, Axes, axes_record, guessed_axes, said_axes
+from .spz_axes import (
+    PLY_AXES,
+    Axes,
+    axes_record,
+    bearings_record,
+    guessed_axes,
+    said_axes,
+    said_bearings,
+)
 
 _MAGIC = 0x5053474E
 """The letters NGSP."""
@@ -247,7 +256,11 @@ class Spz(CaptureFormat):
 
         gaussians, shift = base.decoded(COUNTS[header.degree], (header.number, part))
         antialiased = bool(header.flags & _ANTIALIASED_FLAG)
-        return Capture(path, gaussians, antialiased, data, recolour, shift=shift, notes=notes)
+        capture = Capture(path, gaussians, antialiased, data, recolour, shift=shift, notes=notes)
+        said = said_bearings(file.axes_records, axes)
+        if said is None:
+            return capture
+        return base.with_said_bearings(capture, said[0], said[1])
 
     def pack(self, gaussians: Gaussians, antialiased: bool, origin: Origin) -> list[bytes]:
         """Version 3 in the axes of PLY files, which it names, with as many fractional bits as the largest
@@ -271,6 +284,11 @@ class Spz(CaptureFormat):
             axes_record(),
         ]
         return [zlib.compress(b"".join(parts), 6, wbits=31)]
+
+    def with_bearings(self, pieces: Iterable[bytes], bearings: Bearings) -> list[bytes]:
+        """With an extension behind that of the axes."""
+        whole = zlib.decompress(b"".join(pieces), wbits=31)
+        return [zlib.compress(whole + bearings_record(bearings), 6, wbits=31)]
 
     def keeps(self, gaussians: Gaussians) -> Bools:
         """Those within the reach of 24 bits whose steps suit the bulk."""

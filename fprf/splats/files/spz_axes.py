@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import DataError
+from ...rendering.north import Bearings
 from ..gaussians import Gaussians
 from ..ground import find_ground
 from . import base
@@ -26,6 +27,10 @@ _COORDINATE_SYSTEM = 0xADBE0003
 """Type of the extension that says which axes a file has; its payload is their number."""
 _RECORD_HEAD = struct.Struct("<II")
 """Type of an extension and length of its payload, which follows."""
+_OWN_BEARINGS = 0x46500001
+"""Type of fprf's extension: the upper half names who it is of, and readers pass over those that they do not know."""
+_BEARINGS = struct.Struct("<6f")
+"""Its payload: north and up."""
 _AXES_NUMBER = struct.Struct("<I")
 """The payload of the extension that names the axes."""
 _MAX_AXES_NUMBER = 16
@@ -90,6 +95,24 @@ OWN_AXES = Axes(False, (1.0, -1.0, -1.0))
 def axes_record() -> bytes:
     """The extension that says that a file has the axes of PLY files."""
     return _RECORD_HEAD.pack(_COORDINATE_SYSTEM, _AXES_NUMBER.size) + _AXES_NUMBER.pack(RIGHT_DOWN_FRONT)
+
+
+def bearings_record(bearings: Bearings) -> bytes:
+    """The extension that says where north and up are, in the axes of PLY files; 0 0 0 = not known."""
+    payload = _BEARINGS.pack(*bearings.north, *(bearings.up or (0.0, 0.0, 0.0)))
+    return _RECORD_HEAD.pack(_OWN_BEARINGS, len(payload)) + payload
+
+
+def said_bearings(extensions: bytes, axes: Axes) -> Floats | None:
+    """North and up, as rows of an array, by the extension that names them; None without one."""
+    at = 0
+    while at + _RECORD_HEAD.size <= len(extensions):
+        kind, size = _RECORD_HEAD.unpack_from(extensions, at)
+        at += _RECORD_HEAD.size
+        if kind == _OWN_BEARINGS and size == _BEARINGS.size and at + size <= len(extensions):
+            return axes.points(np.array(_BEARINGS.unpack_from(extensions, at)).reshape(2, 3))
+        at += size
+    return None
 
 
 def said_axes(path: Path, extensions: bytes, degree: int) -> Axes | None:
