@@ -18,6 +18,7 @@ from torch import Tensor
 from ..rendering.north import (
     MAX_UNCERTAINTY_DEGREES,
     MIN_FIXES,
+    USUAL_ACCURACY_METRES,
     North,
     fit_north,
     metres_from,
@@ -41,6 +42,8 @@ class Position(NamedTuple):
 
     latitude: float
     longitude: float
+    accuracy: float = 0.0
+    """Metres, as the receiver says; 0 where it does not."""
 
 
 def read_position(path: Path) -> Position | None:
@@ -50,12 +53,13 @@ def read_position(path: Path) -> Position | None:
             block = exif_of(file, path).get_ifd(IFD.GPSInfo)
         latitude = _degrees(block[GPS.GPSLatitude], block[GPS.GPSLatitudeRef], "NS")
         longitude = _degrees(block[GPS.GPSLongitude], block[GPS.GPSLongitudeRef], "EW")
+        accuracy = float(block.get(GPS.GPSHPositioningError, 0.0))
     except Exception:  # values of other types, and whatever Pillow raises over a damaged block
         return None
     # A receiver without satellites writes zeros.
     if not (abs(latitude) < 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
         return None
-    return Position(latitude, longitude)
+    return Position(latitude, longitude, accuracy if 0 < accuracy < math.inf else 0.0)
 
 
 def _degrees(parts: Sequence[object], letter: object, letters: str) -> float:
@@ -96,7 +100,8 @@ def north_of(
     if count < MIN_FIXES:
         return f"{count} of the photographs have a position (GPS), {MIN_FIXES} at least tell it"
     found = torch.tensor(positions, dtype=torch.float64)
-    fit = fit_north(places, metres_from(found[:, 0], found[:, 1]), up)
+    accuracy = max(USUAL_ACCURACY_METRES, float(found[:, 2].median()))
+    fit = fit_north(places, metres_from(found[:, 0], found[:, 1]), up, accuracy)
     by = f"positions (GPS) of {fit.kept} photographs"
     if math.isinf(fit.uncertainty):
         return f"{by} of {count} agree with the cameras' places, all others contradict"

@@ -20,12 +20,11 @@ MAX_UNCERTAINTY_DEGREES = 10.0
 """Standard deviation of a direction that counts as north, at most."""
 MIN_FIXES = 4
 """Positions that tell north, at least: three leave no error to judge them by."""
-DRIFT_METRES = 3.0
-"""Deviation by which errors of positions differ from one end of a walk to the other: what of that is in proportion to
-the way hides in the fit. A street of 200 m by a phone: its halves, of 60 and 106 m, are turned by 2.5 degrees either way.
+USUAL_ACCURACY_METRES = 3.0
+"""Deviation of positions of phones and drones in the open, at least. By as much their errors differ from one end of a
+walk to the other: what of that is in proportion to the way hides in the fit. A street of 200 m by a phone: its halves, of
+60 and 106 m, are turned by 2.5 degrees either way.
 """
-_MIN_NOISE_METRES = 2.0
-"""Deviation of positions that is expected at least, before any is called wrong."""
 _MIN_INDEPENDENT_FIXES = 2.0
 """Positions whose errors are independent, at least, however alike those of neighbours are."""
 _MIN_KEPT_SHARE = 0.6
@@ -113,10 +112,13 @@ def metres_from(
 
 
 def fit_north(
-    places: Annotated[Tensor, "N 3"], metres: Annotated[Tensor, "N 2"], up: Annotated[Tensor, "3"]
+    places: Annotated[Tensor, "N 3"],
+    metres: Annotated[Tensor, "N 2"],
+    up: Annotated[Tensor, "3"],
+    accuracy: float = USUAL_ACCURACY_METRES,
 ) -> NorthFit:
     """North from at least `MIN_FIXES` places in a world, in the order in which they were taken, and where they are, in
-    metres east and north; some may be wrong.
+    metres east and north; some may be wrong. `accuracy` is their deviation in metres, at least.
     """
     up = torch.nn.functional.normalize(up.double(), dim=0)
     right, ahead = _level_basis(up)
@@ -127,7 +129,7 @@ def fit_north(
     kept = torch.ones(len(seen), dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
         error = (known - turn * seen - shift).abs()
-        deviation = max(float(error.median()) / _MEDIAN_OF_RAYLEIGH, _MIN_NOISE_METRES)
+        deviation = max(float(error.median()) / _MEDIAN_OF_RAYLEIGH, accuracy)
         agrees = error < _MAX_DEVIATIONS * deviation
         if bool((agrees == kept).all()) or int(agrees.sum()) < MIN_FIXES:
             break
@@ -140,10 +142,13 @@ def fit_north(
     error = (known - turn * seen - shift)[kept]
     extent = 2 * float(around.max())
     noise = float(error.abs().square().sum()) / max(2 * count - 4, 1)
-    spread = float(around.square().mean()) * _independent(error)
+    # Of errors smaller than expected nothing follows about how alike they are.
+    independent = float(count) if noise < accuracy**2 else _independent(error)
+    noise = max(noise, accuracy**2)
+    spread = float(around.square().mean()) * independent
     uncertainty = math.inf
     if spread > 0 and count >= _MIN_KEPT_SHARE * len(seen):
-        uncertainty = math.degrees(math.sqrt(noise / spread + (DRIFT_METRES / extent) ** 2))
+        uncertainty = math.degrees(math.sqrt(noise / spread + (accuracy / extent) ** 2))
     # Where a z points to i.
     there = 1j * turn.conj() / turn.abs().clamp_min(1e-300)
     direction = there.real * right + there.imag * ahead

@@ -55,7 +55,16 @@ def geotag(path: Path, exif: PIL.Image.Exif) -> None:
 def test_a_position_is_read_from_any_format(tmp_path: Path, suffix: str, position: Position) -> None:
     path = tmp_path / f"a.{suffix}"
     PIL.Image.new("RGB", (8, 8)).save(path, exif=block(position, GPSAltitude=None))
-    assert read_position(path) == pytest.approx(position, abs=1e-7)
+    found = read_position(path)
+    assert found == pytest.approx(position, abs=1e-7) and found is not None and found.accuracy == 0
+
+
+@pytest.mark.parametrize(("said", "accuracy"), [(4.75, 4.75), (-1.0, 0.0), (None, 0.0)])
+def test_the_accuracy_of_a_receiver_is_read(tmp_path: Path, said: float | None, accuracy: float) -> None:
+    path = tmp_path / "a.jpg"
+    PIL.Image.new("RGB", (8, 8)).save(path, exif=block(LUND, GPSHPositioningError=said))
+    found = read_position(path)
+    assert found is not None and found.accuracy == pytest.approx(accuracy)
 
 
 @pytest.mark.parametrize("raw", [False, True])
@@ -68,7 +77,7 @@ def test_a_position_is_read_from_tiff_and_raw_photographs(tmp_path: Path, raw: b
     east = {3: (2, [b"E"]), 4: (5, [(18, 1), (24, 1), (0, 1)])}
     path = tmp_path / "a.dng"
     path.write_bytes(tiff(first, south | east, [pixels.tobytes()]))
-    assert read_position(path) == pytest.approx((-33.901, 18.4))
+    assert read_position(path) == pytest.approx((-33.901, 18.4, 0.0))
 
 
 @pytest.mark.parametrize(
