@@ -73,6 +73,11 @@ BENCHMARKS = {
         "--steps 60 --pictures 16 --suns 1 --views 1",
         "a run of Gaussians of a town in the palette overcast; without one it trains it first",
     ),
+    "unlit": Benchmark(
+        "towns captured in the sun, whose light is taken away, against their tracer's clouds",
+        "--steps 60 --towns 1 --views 1",
+        "nothing but fprf; some minutes",
+    ),
     "captured_sun": Benchmark(
         "the sun that towns were captured in, found from Gaussians of their tracer",
         "--towns 1 --clouded 1",

@@ -141,7 +141,7 @@ def _figures(config: SunBenchConfig, run: Path) -> dict[str, object]:
     rows = []
     for azimuth, elevation in _SUNS[: config.suns]:
         look = replace(palette("day"), azimuth=azimuth, elevation=elevation)
-        truth = torch.stack([_pixels(render(town, view, look).rgb) for view in views])
+        truth = torch.stack([pixels(render(town, view, look).rgb) for view in views])
         sun = torch.from_numpy(sun_direction(look)).float()
         light = Light(
             torch.tensor(look.sun), torch.tensor(look.ambient), torch.ones(3), torch.ones(3), 1.0, elevation
@@ -181,7 +181,7 @@ def _traced(town: Town, views: Sequence[View]) -> tuple[Annotated[Tensor, "V P"]
     return torch.stack(things), _Truth(torch.stack(solid), np.stack(points), np.stack(normals))
 
 
-def _pixels(picture: NDArray[np.uint8]) -> Annotated[Tensor, "P 3"]:
+def pixels(picture: NDArray[np.uint8]) -> Annotated[Tensor, "P 3"]:
     return torch.from_numpy(picture).flatten(0, 1).float() / 255
 
 
@@ -205,18 +205,20 @@ def light_rows(
         "shadows": Received(surfaces.normals, surfaces.sure, ones, reach),
         "all": Received(surfaces.normals, surfaces.sure, known.openness, reach),
     }
-    shown = {"gain": _drawn(scene, gaussians.harmonics, judged.cameras)}
+    shown = {"gain": drawn_views(scene, gaussians.harmonics, judged.cameras)}
     for name, each in received.items():
         gain = gains(each, light, sun, known.up, gaussians.colours, surfaces.weights)
-        shown[name] = _drawn(scene, relit_harmonics(gaussians.harmonics, gain), judged.cameras)
-    found = {"plain": _psnr(shown["gain"], truth, judged.things)}
+        shown[name] = drawn_views(scene, relit_harmonics(gaussians.harmonics, gain), judged.cameras)
+    found = {"plain": psnr(shown["gain"], truth, judged.things)}
     for name, pictures in shown.items():
-        found[name] = _psnr(_with_best_gain(pictures, truth, judged.things), truth, judged.things)
+        found[name] = psnr(with_best_gain(pictures, truth, judged.things), truth, judged.things)
     found["seconds"] = seconds
     return found
 
 
-def _drawn(scene: SplatScene, harmonics: Tensor, cameras: Sequence[Pinhole]) -> Annotated[Tensor, "V P 3"]:
+def drawn_views(
+    scene: SplatScene, harmonics: Tensor, cameras: Sequence[Pinhole]
+) -> Annotated[Tensor, "V P 3"]:
     lit = scene.gaussians.recoloured(harmonics)
     pictures = []
     for camera in cameras:
@@ -224,11 +226,11 @@ def _drawn(scene: SplatScene, harmonics: Tensor, cameras: Sequence[Pinhole]) -> 
     return torch.stack(pictures)
 
 
-def _psnr(pictures: Tensor, truth: Tensor, where: Tensor) -> float:
+def psnr(pictures: Tensor, truth: Tensor, where: Tensor) -> float:
     return -10 * math.log10(float((pictures - truth)[where].square().mean()))
 
 
-def _with_best_gain(pictures: Tensor, truth: Tensor, where: Tensor) -> Tensor:
+def with_best_gain(pictures: Tensor, truth: Tensor, where: Tensor) -> Tensor:
     """Pictures after the factor of each channel's linear light that brings them nearest to the truth."""
     some = where.flatten().nonzero()[::9, 0]
     out = []

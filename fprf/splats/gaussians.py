@@ -226,18 +226,35 @@ class Bulk(NamedTuple):
     """Longest side of the box of the middle 80 % along each axis; of all points where that has none."""
     apart: Annotated[NDArray[np.float64], "N"]
     """Distance of each point from that box, the largest along an axis, in `side`; 0 within."""
+    low: Annotated[NDArray[np.float64], "3"]
+    """Lowest corner of that box."""
+    high: Annotated[NDArray[np.float64], "3"]
+    """Highest corner."""
+
+    def distances(self, points: Annotated[NDArray[Any], "M 3"]) -> Annotated[NDArray[np.float64], "M"]:
+        """Distances of other points, as `apart` has them."""
+        return _apart(points, self.low, self.high, self.side)
 
 
 def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
     """The bulk of finite points. Up to a tenth of them may lie anywhere on either side without moving it."""
     if not len(points):
-        return Bulk(0.0, np.zeros(0))
+        return Bulk(0.0, np.zeros(0), np.zeros(3), np.zeros(3))
     # Of many points a sample says where the middle is.
     some = points[:: max(1, len(points) // _MAX_BULK_POINTS)].astype(np.float64)
     low, high = np.percentile(some, (10, 90), axis=0)
     side = float((high - low).max()) or float(np.ptp(points.astype(np.float64), axis=0).max())
-    apart = np.maximum(low - points, points - high).max(1).clip(0)
-    return Bulk(side, apart / (side or 1.0))
+    return Bulk(side, _apart(points, low, high, side), low, high)
+
+
+def _apart(
+    points: Annotated[NDArray[Any], "M 3"],
+    low: Annotated[NDArray[np.float64], "3"],
+    high: Annotated[NDArray[np.float64], "3"],
+    side: float,
+) -> Annotated[NDArray[np.float64], "M"]:
+    apart: NDArray[np.float64] = np.maximum(low - points, points - high).max(1).clip(0)
+    return apart / (side or 1.0)
 
 
 def cells_of(

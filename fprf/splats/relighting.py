@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..light.captured import USUAL_STRENGTH, CapturedSun, LogLight, sky_ratio
+from ..light.captured import CapturedSun, LogLight, sky_part
 from ..light.config import SunConfig
 from ..light.relight import LINEAR_OFFSET, Received, affine_change, exposed_gain, gains, sun_share
 from ..light.skies import MIN_SKY_HEIGHT, sky_pixels
@@ -41,6 +41,8 @@ _MAX_BLOCKER_DISTANCE = 0.5
 """Distance from the bulk (`Bulk.apart`) up to which Gaussians cast shadows: skies and far surroundings lie
 farther out, four scenes from within have theirs at 0.6 and more (by eye).
 """
+_MIN_SKY_DISTANCE = 2.0
+"""Distance of a sky from the bulk of what lies below the horizon, at least: walls of a street reach 1.8."""
 _OFFSET_SHARE = 0.008
 """Distance of what casts shadows on a point from it, at least, as a share of the width of the views there: nearer
 ones are the surface itself. On the town 0.2 to 0.8 m do alike at 15 m.
@@ -59,8 +61,10 @@ _SOUGHT_BLOCKERS = 30_000
 """Gaussians that cast shadows in the search, at most: of more, some stand for all."""
 _SOUGHT_STEPS = (7.5, 7.5, 3.75)
 """Degrees about the best of these that are tried then."""
-_MIN_EXPLAINED = 0.05
-"""Share of the variance of light that a captured sun explains, at least: cloudy towns stay below (`captured_sun.json`)."""
+_FOLLOWED = 3
+"""Places that are followed by these steps: the best of them is not always the nearest."""
+_MIN_EVIDENCE = 0.06
+"""Evidence of a captured sun (`LogLight.evidence`), at least: cloudy towns stay below (`captured_sun.json`)."""
 _MIN_TRIED_GAUSSIANS = 500
 """Gaussians that tell a captured sun."""
 _LIFT_SHARE = 0.4
@@ -103,7 +107,9 @@ class Illumination:
     """Thickness of the surface: mean distance from it of what is seen with it."""
     openness: Annotated[Tensor, "N"]
     far: Annotated[Tensor, "N"]
-    """Gaussians that neither cast shadows nor lie in them, bool."""
+    """Gaussians that cast no shadows, bool."""
+    beyond: Annotated[Tensor, "N"]
+    """Those whose surfaces no shadow falls on, bool: skies, and what lies far out."""
     sky: Annotated[Tensor, "N"]
     """Those of the sky, bool."""
     heights: Annotated[Tensor, "N"]
@@ -171,7 +177,7 @@ class Illumination:
         found = torch.zeros(len(points))
         for place in places:
             found += transport(self.blockers, points, frame_of(place, self.up), offset, offset, self.blur)
-        return torch.where(self.far, torch.ones(()), found / len(places))
+        return torch.where(self.beyond, torch.ones(()), found / len(places))
 
     @cached_property
     def azimuth(self) -> float:
@@ -198,7 +204,7 @@ class Illumination:
         """The one of some azimuths, the first of equals, from which most of what the views show is lit."""
         some = slice(None, None, max(1, len(self.far) // _TRIED_GAUSSIANS))
         surfaces = Surfaces(*(part[some] for part in self.surfaces))
-        weights = torch.where(self.far[some], torch.zeros(()), surfaces.weights)
+        weights = torch.where(self.beyond[some], torch.zeros(()), surfaces.weights)
         points = self.points[some]
         offset = self.offset[some]
         best = azimuths[0]
@@ -224,7 +230,7 @@ class Illumination:
         return thinned(self, torch.arange(0, len(self.far), every), every)._sought_sun()
 
     def _sought_sun(self) -> CapturedSun | None:
-        shown = torch.where(self.far, torch.zeros(()), self.surfaces.weights).nonzero()[:, 0]
+        shown = torch.where(self.beyond, torch.zeros(()), self.surfaces.weights).nonzero()[:, 0]
         if len(shown) < _MIN_TRIED_GAUSSIANS:
             return None
         # By what the views show of them, and so evenly over pictures.
@@ -232,35 +238,24 @@ class Illumination:
         wanted = (torch.arange(_TRIED_GAUSSIANS) + 0.5) / _TRIED_GAUSSIANS * weight[-1]
         place = torch.searchsorted(weight, wanted).clamp_max(len(shown) - 1)
         some = shown[torch.from_numpy(np.unique(place.numpy()))]
-        log_light = LogLight(self.colours[some])
+        received = Received(*(part[some] for part in self.received))
+        log_light = LogLight(self.colours[some], received, self.surfaces.points[some], self.up)
 
-        def explained(azimuth: float, elevation: float) -> float:
-            ratio = self._sun_over_sky(some, self.sun_direction(azimuth, elevation))
-            return log_light.explained(ratio, USUAL_STRENGTH)
+        def evidence(azimuth: float, elevation: float) -> float:
+            return log_light.evidence(self._sun_over_sky(some, self.sun_direction(azimuth, elevation)))
 
-        best = (0.0, 0.0)
-        most = -math.inf
+        tried = []
         for elevation in _SOUGHT_ELEVATIONS:
             for azimuth in [k * 360.0 / _SOUGHT_AZIMUTHS for k in range(_SOUGHT_AZIMUTHS)]:
-                share = explained(azimuth, elevation)
-                if share > most:
-                    best = (azimuth, elevation)
-                    most = share
-        for step in _SOUGHT_STEPS:
-            around = []
-            for eighth in range(8):
-                turn = math.radians(45.0 * eighth)
-                rise = best[1] + step * math.sin(turn)
-                across = step * math.cos(turn) / max(math.cos(math.radians(best[1])), 0.2)
-                around.append((best[0] + across, min(max(rise, _MIN_SOUGHT_ELEVATION), 89.0)))
-            shares = [explained(*each) for each in around]
-            if max(shares) > most:
-                most = max(shares)
-                best = around[shares.index(most)]
-        if most < _MIN_EXPLAINED:
+                tried.append((evidence(azimuth, elevation), azimuth, elevation))
+        followed = sorted(tried, reverse=True)[:_FOLLOWED]
+        most, azimuth, elevation = max(_followed(start, evidence) for start in followed)
+        if most < _MIN_EVIDENCE:
             return None
-        ratio = self._sun_over_sky(some, self.sun_direction(*best))
-        return CapturedSun((best[0] + 180) % 360 - 180, best[1], most, log_light.strengths(ratio))
+        ratio = self._sun_over_sky(some, self.sun_direction(azimuth, elevation))
+        return CapturedSun(
+            (azimuth + 180) % 360 - 180, elevation, log_light.explained(ratio), log_light.strengths(ratio)
+        )
 
     def _sun_over_sky(
         self, rows: Annotated[Tensor, "n"] | slice, sun: Annotated[Tensor, "3"]
@@ -269,7 +264,7 @@ class Illumination:
         offset = self.offset[rows]
         reach = transport(self.blockers, self.points[rows], frame_of(sun, self.up), offset, offset, self.blur)
         received = Received(*(part[rows] for part in self.received))._replace(reach=reach)
-        return sky_ratio(received, sun_share(received, sun), self.up)
+        return sun_share(received, sun) / sky_part(received, self.up)
 
     @cached_property
     def unlit_gain(self) -> Annotated[Tensor, "N 3"]:
@@ -279,7 +274,7 @@ class Illumination:
             return torch.ones(len(self.far), 3)
         ratio = self._sun_over_sky(slice(None), self.sun_direction(sun.azimuth, sun.elevation))
         change = 1 / (1 + sun.strength * ratio[:, None])
-        change = torch.where(self.far[:, None], torch.ones(()), change)
+        change = torch.where(self.sky[:, None], torch.ones(()), change)
         return exposed_gain(change, self.colours, self.metered, 1.0)
 
     @property
@@ -405,6 +400,23 @@ _CLEAR_SKY_SHARE = 0.75
 """Brightness of a clear sky over that of clouds, in pictures (by eye)."""
 
 
+def _followed(
+    start: tuple[float, float, float], evidence: Callable[[float, float], float]
+) -> tuple[float, float, float]:
+    """Evidence, azimuth and elevation of the best sun that smaller and smaller steps reach from a start."""
+    best = start
+    for step in _SOUGHT_STEPS:
+        around = [best]
+        for eighth in range(8):
+            turn = math.radians(45.0 * eighth)
+            across = step * math.cos(turn) / max(math.cos(math.radians(best[2])), 0.2)
+            azimuth = best[1] + across
+            elevation = min(max(best[2] + step * math.sin(turn), _MIN_SOUGHT_ELEVATION), 89.0)
+            around.append((evidence(azimuth, elevation), azimuth, elevation))
+        best = max(around)
+    return best
+
+
 def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int) -> Illumination:
     """The illumination of some rows alone, one of `every` neighbours, each as much larger where it casts shadows."""
     kept = illumination
@@ -421,6 +433,7 @@ def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int
         spread=kept.spread[rows],
         openness=kept.openness[rows],
         far=kept.far[rows],
+        beyond=kept.beyond[rows],
         sky=kept.sky[rows],
         heights=kept.heights[rows],
         colours=kept.colours[rows],
@@ -439,15 +452,19 @@ def find_illumination(
     chosen = chosen.scaled(max(1.0, float(chosen.size.amax()) / _VIEW_PIXELS))
     pinholes = [covering(chosen, view, near) for view in range(count)]
     surfaces = find_surfaces(*shape, pinholes, up=up, antialiased=antialiased)
-    far = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart > _MAX_BLOCKER_DISTANCE)
+    bulk = bulk_of(gaussians.means.numpy())
+    far = torch.from_numpy(bulk.apart > _MAX_BLOCKER_DISTANCE)
     eyes = cameras.pose[:, :, 3].float().mean(0)
     heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ up
-    sky = far & (heights > MIN_SKY_HEIGHT)
+    above = heights > MIN_SKY_HEIGHT
+    far = far | (above & _behind_ground(gaussians.means, ~above))
+    sky = far & above
     # Half of the views tell as much: on the town all of them are 0.02 dB worse, and take 0.6 s more for a plant.
     like, followed, spread = _seen_again(gaussians, surfaces, far, sky, pinholes[::2], up, antialiased)
-    above = heights > MIN_SKY_HEIGHT
     far = far | sky | ((like > _MIN_LIKENESS) & above)
     sky = sky | ((torch.maximum(like, followed) > _MIN_LIKENESS) & above)
+    # A training may put bare asphalt far too deep; its surface is where the markings around are.
+    beyond = sky | torch.from_numpy(bulk.distances(surfaces.points.numpy()) > _MAX_BLOCKER_DISTANCE)
     covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
     blockers = Blockers(gaussians.means[~far], covariances[~far], gaussians.opacities[~far])
     found = Illumination(
@@ -456,6 +473,7 @@ def find_illumination(
         spread,
         torch.ones(len(gaussians)),
         far,
+        beyond,
         sky,
         heights,
         up,
@@ -463,7 +481,17 @@ def find_illumination(
         gaussians.colours,
     )
     open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
-    return replace(found, openness=torch.where(far, torch.ones(()), open_))
+    return replace(found, openness=torch.where(beyond, torch.ones(()), open_))
+
+
+def _behind_ground(means: Annotated[Tensor, "N 3"], below: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
+    """What lies far outside of all that is below the horizon, bool: where a third of a capture's Gaussians are of the
+    sky, they count for its bulk.
+    """
+    if not bool(below.any()):
+        return below
+    ground = bulk_of(means[below].numpy())
+    return torch.from_numpy(ground.distances(means.numpy()) > _MIN_SKY_DISTANCE)
 
 
 def _seen_again(

@@ -1,11 +1,13 @@
 """Captures in another light: files, styles and mixes of lights."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from splat_ball import ball
+from splat_yard import yard
 from tiny_world import World
 
 from fprf.api import FinishedCapture
@@ -22,7 +24,7 @@ from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
-from fprf.splats.gaussians import Gaussians
+from fprf.splats.gaussians import Gaussians, joined
 from fprf.splats.pinholes import camera_of
 from fprf.splats.relighting import facing_north, find_illumination, relit_harmonics
 from fprf.splats.scene import SplatScene, illuminated, with_illumination
@@ -360,3 +362,57 @@ def test_what_was_found_about_light_is_kept(scene: SplatScene, tmp_path: Path) -
     assert with_illumination(scene, tmp_path).light_found.captured_sun is None
     file.write_bytes(b"torn")
     assert torch.equal(with_illumination(sunny, tmp_path).light_found.gain(NOON), found.gain(NOON))
+
+
+def around_the_yard(away: float = 4.0) -> Cameras:
+    """Level views of the yard from eight places, as high as its house."""
+    turn = torch.arange(8).double() * (math.pi / 4)
+    eye = torch.stack([away * turn.cos(), away * turn.sin(), torch.full((8,), 1.2).double()], 1)
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    middle = torch.tensor([[0.0, 0.0, 0.9]]).double().expand(8, 3)
+    return pinhole(look_at(eye, middle, up), width=96, height=72, fov=60)
+
+
+def test_a_sky_of_most_gaussians_casts_no_shadows() -> None:
+    made = yard(2000)
+    draw_ = torch.Generator().manual_seed(0)
+    way = torch.nn.functional.normalize(torch.randn(3000, 3, generator=draw_), dim=1)
+    way[:, 2] = way[:, 2].abs()
+    dome = Gaussians(
+        60 * way,
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3000, 1),
+        torch.full((3000, 3), math.log(2.0)),
+        torch.full((3000,), 4.0),
+        torch.full((3000, 1, 3), 1.0),
+    )
+    known = find_illumination(joined([made, dome]), around_the_yard(), antialiased=False, near=0.05)
+    alone = find_illumination(made, around_the_yard(), antialiased=False, near=0.05)
+    high = way[:, 2] > 0.2
+    assert bool(known.sky[2000:][high].all()) and not bool(known.sky[:1000].any())
+    sun = known.sun_direction(30.0, 40.0)
+    assert float((known.reach(sun)[:2000] - alone.reach(sun)).abs().mean()) < 0.05
+    assert float(known.openness[:1000].mean()) > 0.5
+
+
+def test_shadows_fall_on_ground_that_a_training_left_too_deep() -> None:
+    made = yard(4000)
+    cameras = around_the_yard().select(torch.tensor([0]))
+    eye = cameras.pose[0, :, 3].float()
+    ground = torch.arange(4000) < 2000
+    deep = ground & (torch.arange(4000) % 9 == 0)
+    # As one view sees it nothing changes: nine times as far away, and nine times as wide.
+    pushed = replace(
+        made,
+        means=torch.where(deep[:, None], eye + 9 * (made.means - eye), made.means),
+        log_scales=torch.where(deep[:, None], made.log_scales + math.log(9.0), made.log_scales),
+    )
+    known = find_illumination(pushed, cameras, antialiased=False, near=0.05)
+    before = find_illumination(made, cameras, antialiased=False, near=0.05)
+    shown = deep & (before.surfaces.weights > 1)
+    assert float(known.far[shown].float().mean()) > 0.8
+    assert float(known.beyond[shown].float().mean()) < 0.1
+    for azimuth in (60.0, -60.0):
+        sun = known.sun_direction(azimuth, 30.0)
+        wanted = before.reach(sun)[shown]
+        assert 0.05 < float((wanted < 0.5).float().mean()) < 0.95
+        assert float((known.reach(sun)[shown] - wanted).abs().mean()) < 0.15
