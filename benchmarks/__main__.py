@@ -80,7 +80,7 @@ BENCHMARKS = {
     ),
     "captured_sun": Benchmark(
         "the sun that towns were captured in, found from Gaussians of their tracer",
-        "--towns 1 --clouded 1",
+        "--towns 1 --clouded 1 --earlier 0",
     ),
     "reference_sun": Benchmark(
         "the sun of photographs for --sun auto: pictures of towns in the sun and under clouds",

@@ -29,8 +29,9 @@ from fprf.light.relight import Received, encoded, gains, linear
 from fprf.light.sky import Light
 from fprf.ops.rasterise.rendering import Pinhole
 from fprf.splats.drawing import draw
+from fprf.splats.find_light import find_illumination
 from fprf.splats.pinholes import covering
-from fprf.splats.relighting import Illumination, find_illumination, relit_harmonics
+from fprf.splats.relighting import Illumination, relit_harmonics
 from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.loading import open_run

@@ -29,8 +29,8 @@ from fprf.errors import UsageError
 from fprf.light.config import SunConfig
 from fprf.light.relight import encoded
 from fprf.light.sky import light_of
+from fprf.splats.find_light import find_illumination
 from fprf.splats.pinholes import covering
-from fprf.splats.relighting import find_illumination
 from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.loading import open_run

@@ -20,8 +20,9 @@ from fprf.checks import at_least
 from fprf.cli.parsing import load_method, parse
 from fprf.errors import UsageError
 from fprf.light.config import SunConfig
+from fprf.splats.find_light import find_illumination
 from fprf.splats.pinholes import covering
-from fprf.splats.relighting import find_illumination, relit_harmonics
+from fprf.splats.relighting import relit_harmonics
 from fprf.splats.scene import SplatScene
 from fprf.training.driver import train
 from fprf.training.loading import open_run

@@ -11,6 +11,8 @@ much.
 N Gaussians that are looked at, D directions.
 """
 
+import math
+from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 import torch
@@ -47,6 +49,20 @@ _MIN_SKY = 0.15
 """Least share of the sky's light, so that ratios are finite."""
 
 
+_SOUGHT_AZIMUTHS = 16
+"""Places around that are tried for the captured sun, at each elevation."""
+_SOUGHT_ELEVATIONS = (30.0, 45.0, 60.0)
+"""Degrees above the horizon. Lower ones explain much of towns under clouds, too: what faces them is brighter."""
+_MIN_SOUGHT_ELEVATION = 25.0
+"""Degrees above the horizon down to which it is sought."""
+_SOUGHT_STEPS = (7.5, 7.5, 3.75)
+"""Degrees about the best of these that are tried then."""
+_FOLLOWED = 3
+"""Places that are followed by these steps: the best of them is not always the nearest."""
+_MIN_EVIDENCE = 0.06
+"""Evidence of a captured sun (`LogLight.evidence`), at least: cloudy towns stay below (`captured_sun.json`)."""
+
+
 class CapturedSun(NamedTuple):
     """A sun that a capture was taken in."""
 
@@ -58,6 +74,36 @@ class CapturedSun(NamedTuple):
     """Share of the variance of log light within groups that it explains, at most 1."""
     strength: Annotated[Tensor, "3"]
     """s above of red, green and blue."""
+
+
+def sought(evidence: Callable[[float, float], float]) -> tuple[float, float] | None:
+    """Azimuth and elevation, in degrees, of the sun that there is most evidence of; None where there is too little."""
+    tried = []
+    for elevation in _SOUGHT_ELEVATIONS:
+        for azimuth in [k * 360.0 / _SOUGHT_AZIMUTHS for k in range(_SOUGHT_AZIMUTHS)]:
+            tried.append((evidence(azimuth, elevation), azimuth, elevation))
+    starts = sorted(tried, reverse=True)[:_FOLLOWED]
+    most, azimuth, elevation = max(_followed(start, evidence) for start in starts)
+    if most < _MIN_EVIDENCE:
+        return None
+    return azimuth, elevation
+
+
+def _followed(
+    start: tuple[float, float, float], evidence: Callable[[float, float], float]
+) -> tuple[float, float, float]:
+    """Evidence, azimuth and elevation of the best sun that smaller and smaller steps reach from a start."""
+    best = start
+    for step in _SOUGHT_STEPS:
+        around = [best]
+        for eighth in range(8):
+            turn = math.radians(45.0 * eighth)
+            across = step * math.cos(turn) / max(math.cos(math.radians(best[2])), 0.2)
+            azimuth = best[1] + across
+            elevation = min(max(best[2] + step * math.sin(turn), _MIN_SOUGHT_ELEVATION), 89.0)
+            around.append((evidence(azimuth, elevation), azimuth, elevation))
+        best = max(around)
+    return best
 
 
 def scene_light(colours: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:

@@ -20,10 +20,11 @@ from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from .captured import scene_light
 from .config import Colour
-from .relight import SHOULDER
 from .sky import LUMA
 
 _LONGEST_PIXELS = 384
@@ -154,9 +155,8 @@ def facing_strength(sun: SeenSun, elevation: float) -> Colour:
 
 def _scene_light(photo: NDArray[np.uint8]) -> _Pixels:
     """Linear light before a camera's shoulder."""
-    value = photo.astype(np.float32) / 255
-    curve = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return (curve / (1 - SHOULDER * curve)).astype(np.float32)
+    light: _Pixels = scene_light(torch.from_numpy(photo) / 255).numpy()
+    return light
 
 
 def _sky(photo: NDArray[np.uint8]) -> NDArray[np.bool_]:

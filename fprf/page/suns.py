@@ -3,7 +3,7 @@
 Bytes of N packed Gaussians:
 
 level    how far a surface faces the sky; of the sky the sine of its height
-open     root of the share of the sky that is open to it, at least 36; 0 = it belongs to the sky
+open     share of the sky's light that comes to it (`relight.sky_share`), at least 13; 0 = it belongs to the sky
 met      of one light: share of the sun's light that meets it
 
 A light has few numbers beside its bytes: what of the sun, the sky and the ground falls on a surface, each times the
@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..light.captured_sky import MAX_HUE_GAIN, MAX_SKY_GAIN, MIN_BLUENESS, MIN_SKY_COLOUR
 from ..light.config import SunConfig
 from ..light.day import day
 from ..light.relight import (
@@ -31,7 +32,7 @@ from ..light.relight import (
     sky_share,
     sun_share,
 )
-from ..splats.relighting import MAX_HUE_GAIN, MAX_SKY_GAIN, MIN_BLUENESS, MIN_SKY_COLOUR, Illumination, Reach
+from ..splats.relighting import Illumination, Reach
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,10 @@ from ..io.cache import forget_oldest
 from ..io.tensorfiles import load_sealed, save_kept
 from ..light.captured import CapturedSun
 from ..light.surfaces import Surfaces
-from ..light.transport import Blockers, covariances_of
 from ..rendering.cameras import Cameras
+from .find_light import blockers_of, find_illumination
 from .gaussians import Gaussians
-from .relighting import Illumination, find_illumination
+from .relighting import Illumination
 
 _LIGHT_CACHE_VERSION = 4
 """Of what is found: it counts up whenever the same scene gives something else."""
@@ -80,15 +80,13 @@ def _read(path: Path, gaussians: Gaussians) -> Illumination | None:
         return None
     with suppress(OSError):  # another process may just have removed it
         os.utime(path)
-    covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
-    blockers = Blockers(gaussians.means[~far], covariances[~far], gaussians.opacities[~far])
     sun = None
     if "sun" in kept:
         azimuth, elevation, explained = kept["sun"][:3].tolist()
         sun = CapturedSun(azimuth, elevation, explained, kept["sun"][3:])
     return Illumination(
         surfaces,
-        blockers,
+        blockers_of(gaussians, far),
         spread,
         openness,
         far,

@@ -1,70 +1,32 @@
-"""Another light on Gaussians: what is found out about them once, and their colours under a sun and a sky."""
+"""Another light on Gaussians: their colours under a sun and a sky, from what `find_light` finds out about them."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, NamedTuple, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..light.captured import CapturedSun, LogLight, sky_part
+from ..light.captured import CapturedSun, LogLight, sky_part, sought
+from ..light.captured_sky import CapturedSky, fitted_sky
 from ..light.config import SunConfig
 from ..light.relight import LINEAR_OFFSET, Received, affine_change, exposed_gain, gains, sun_share
-from ..light.skies import MIN_SKY_HEIGHT, sky_pixels
-from ..light.sky import LUMA, Light, horizon_tint, light_of
-from ..light.surfaces import Surfaces, find_surfaces
-from ..light.transport import (
-    Blockers,
-    covariances_of,
-    disc_directions,
-    frame_of,
-    openness,
-    transport,
-)
+from ..light.sky import Light, light_of
+from ..light.surfaces import Surfaces
+from ..light.transport import Blockers, disc_directions, frame_of, transport
 from ..ops.harmonics import recoloured
-from ..ops.rasterise.rendering import Pinhole, lift
-from ..rendering.cameras import Cameras
-from ..rendering.north import North, world_axes
-from .drawing import draw
-from .gaussians import Gaussians, bulk_of
-from .pinholes import covering
+from ..rendering.north import North
 from .restyle import all_around
 
-_VIEWS = 16
-"""Views that surfaces are found in."""
-_VIEW_PIXELS = 320
-"""Longer side of these, at most."""
-_MAX_BLOCKER_DISTANCE = 0.5
-"""Distance from the bulk (`Bulk.apart`) up to which Gaussians cast shadows: skies and far surroundings lie
-farther out, four scenes from within have theirs at 0.6 and more (by eye).
-"""
-_MIN_SKY_DISTANCE = 2.0
-"""Distance of a sky from the bulk of what lies below the horizon, at least: walls of a street reach 1.8."""
 _OFFSET_SHARE = 0.008
 """Distance of what casts shadows on a point from it, at least, as a share of the width of the views there: nearer
 ones are the surface itself. On the town 0.2 to 0.8 m do alike at 15 m.
 """
-_MAX_SPREAD_SHARE = 0.2
-"""Distance of a Gaussian from its surface that counts for how thick that is, at most, as a share of that width."""
-_MIN_SHOWN_PIXELS = 1e-2
-"""Weight of a Gaussian in all views, from which on they say something about it."""
-_SOUGHT_AZIMUTHS = 16
-"""Places around that are tried for the captured sun, at each elevation."""
-_SOUGHT_ELEVATIONS = (30.0, 45.0, 60.0)
-"""Degrees above the horizon. Lower ones explain much of towns under clouds, too: what faces them is brighter."""
-_MIN_SOUGHT_ELEVATION = 25.0
-"""Degrees above the horizon down to which it is sought."""
 _SOUGHT_BLOCKERS = 30_000
 """Gaussians that cast shadows in the search, at most: of more, some stand for all."""
-_SOUGHT_STEPS = (7.5, 7.5, 3.75)
-"""Degrees about the best of these that are tried then."""
-_FOLLOWED = 3
-"""Places that are followed by these steps: the best of them is not always the nearest."""
-_MIN_EVIDENCE = 0.06
-"""Evidence of a captured sun (`LogLight.evidence`), at least: cloudy towns stay below (`captured_sun.json`)."""
 _MIN_TRIED_GAUSSIANS = 500
 """Gaussians that tell a captured sun."""
 _LIFT_SHARE = 0.4
@@ -85,16 +47,6 @@ _TRIED_ELEVATION = 20.0
 """Degrees above the horizon at which they are tried: between golden hour and noon."""
 _TRIED_GAUSSIANS = 8192
 """Gaussians that they are tried on, about."""
-_MIN_LIKENESS = 0.6
-"""Likeness to the sky of the pixels of a Gaussian of the sky, at least (by eye)."""
-MIN_SKY_COLOUR = 0.02
-"""Linear light that a captured sky has at least."""
-MIN_BLUENESS = 0.2
-"""Logarithm of blue over red of a captured sky that counts as blue, at least (by eye)."""
-MAX_SKY_GAIN = 4.0
-"""Of a sky's linear light (by eye)."""
-MAX_HUE_GAIN = 20.0
-"""Of a channel of a blue sky that turns grey: its red is so much darker (by eye)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,14 +196,10 @@ class Illumination:
         def evidence(azimuth: float, elevation: float) -> float:
             return log_light.evidence(self._sun_over_sky(some, self.sun_direction(azimuth, elevation)))
 
-        tried = []
-        for elevation in _SOUGHT_ELEVATIONS:
-            for azimuth in [k * 360.0 / _SOUGHT_AZIMUTHS for k in range(_SOUGHT_AZIMUTHS)]:
-                tried.append((evidence(azimuth, elevation), azimuth, elevation))
-        followed = sorted(tried, reverse=True)[:_FOLLOWED]
-        most, azimuth, elevation = max(_followed(start, evidence) for start in followed)
-        if most < _MIN_EVIDENCE:
+        found = sought(evidence)
+        if found is None:
             return None
+        azimuth, elevation = found
         ratio = self._sun_over_sky(some, self.sun_direction(azimuth, elevation))
         return CapturedSun(
             (azimuth + 180) % 360 - 180, elevation, log_light.explained(ratio), log_light.strengths(ratio)
@@ -321,100 +269,18 @@ class Illumination:
                 # The sky keeps the colours of the references, which show it in that light.
                 gain[self.sky] = 1.0
             elif bool(self.sky.any()):
-                gain[self.sky] = self.sky_gain(light)
+                gain[self.sky] = self.captured_sky.gain(self.colours[self.sky], self.heights[self.sky], light)
         return 1 + config.sun_strength * (gain - 1)
 
-    def sky_gain(self, light: Light) -> Annotated[Tensor, "S 3"]:
-        """Factors of colours + 0.055 that give the captured sky, in the mean at each height, the light's own colours.
-
-        Where the captured sky is bluer than these, clouds and what is between them take one hue: of both only the
-        brightness stays. Else clouds would turn as much more orange as the blue turns grey.
-        """
-        height = self.heights[self.sky].clamp(0, 1)[:, None]
-        captured = self.captured_sky
-        mean = captured.mean_at(height)
-        horizon, zenith = captured.colours_in(light)
-        wanted = torch.lerp(horizon, zenith, height.sqrt())
-        own = (self.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
-        luma = torch.tensor(LUMA)
-        brighter = ((own @ luma) / (mean @ luma))[:, None]
-        one_hue = (wanted * brighter / own.clamp_min(MIN_SKY_COLOUR)).clamp_max(MAX_HUE_GAIN)
-        blue = blueness(mean)
-        share = ((blue - blueness(wanted)) / blue.clamp_min(MIN_BLUENESS)).clamp(0, 1)[:, None]
-        kept = (wanted / mean).clamp_max(MAX_SKY_GAIN)
-        gain: Tensor = torch.exp(torch.lerp(kept.log(), one_hue.log(), share) / 2.4)
-        return gain
-
     @cached_property
-    def captured_sky(self) -> "CapturedSky":
+    def captured_sky(self) -> CapturedSky:
         """Colours of the captured sky by height."""
-        height = self.heights[self.sky].clamp(0, 1)
-        linear = (self.colours[self.sky].clamp(0, 1) + LINEAR_OFFSET).pow(2.4)
-        weight = (self.surfaces.weights[self.sky] + 1e-6)[:, None]
-        rows = torch.stack([torch.ones_like(height), height], 1)
-        fit = torch.linalg.lstsq((rows * weight.sqrt()).double(), (linear * weight.sqrt()).double()).solution
-        found = CapturedSky(fit.float(), 0.0)
-        mean = found.mean_at(height[:, None])
-        return found._replace(brightness=float((mean * weight).sum() / (3 * weight.sum())))
+        sky = self.sky
+        return fitted_sky(self.colours[sky], self.heights[sky], self.surfaces.weights[sky])
 
 
 Reach: TypeAlias = Callable[[Annotated[Tensor, "3"], float], Annotated[Tensor, "N"]]
 """Share of a sun's light that reaches each Gaussian, by its direction and its degrees."""
-
-
-class CapturedSky(NamedTuple):
-    """The sky as captured, in linear light."""
-
-    fit: Annotated[Tensor, "2 3"]
-    """Colour at the horizon, and what the height adds to it."""
-    brightness: float
-
-    def mean_at(self, height: Annotated[Tensor, "S 1"]) -> Annotated[Tensor, "S 3"]:
-        """Colours at sines of heights in [0, 1]."""
-        return (self.fit[0] + height * self.fit[1]).clamp_min(MIN_SKY_COLOUR)
-
-    def colours_in(self, light: Light) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
-        """Colours of the sky at the horizon and overhead in another light. A clear sky that was captured bluer than the
-        light's stays as it is in the sun, but for what a low sun makes of the horizon.
-        """
-        own = self.mean_at(torch.tensor([[0.0], [1.0]]))
-        if bool(light.sun.any()) and float(blueness(own[1])) > float(blueness(light.zenith)):
-            return light.brightness * own[0] * horizon_tint(light), light.brightness * own[1]
-        level = self.level(light)
-        return level * light.horizon, level * light.zenith
-
-    def level(self, light: Light) -> float:
-        """Brightness in another light: the sky stays as bright as it is, but for what the light asks."""
-        level = light.brightness * self.brightness
-        if bool(light.sun.any()):
-            level *= _CLEAR_SKY_SHARE
-        return level
-
-
-def blueness(colour: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:
-    """Logarithm of blue over red of linear light."""
-    return (colour[..., 2] / colour[..., 0]).log()
-
-
-_CLEAR_SKY_SHARE = 0.75
-"""Brightness of a clear sky over that of clouds, in pictures (by eye)."""
-
-
-def _followed(
-    start: tuple[float, float, float], evidence: Callable[[float, float], float]
-) -> tuple[float, float, float]:
-    """Evidence, azimuth and elevation of the best sun that smaller and smaller steps reach from a start."""
-    best = start
-    for step in _SOUGHT_STEPS:
-        around = [best]
-        for eighth in range(8):
-            turn = math.radians(45.0 * eighth)
-            across = step * math.cos(turn) / max(math.cos(math.radians(best[2])), 0.2)
-            azimuth = best[1] + across
-            elevation = min(max(best[2] + step * math.sin(turn), _MIN_SOUGHT_ELEVATION), 89.0)
-            around.append((evidence(azimuth, elevation), azimuth, elevation))
-        best = max(around)
-    return best
 
 
 def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int) -> Illumination:
@@ -438,88 +304,6 @@ def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int
         heights=kept.heights[rows],
         colours=kept.colours[rows],
     )
-
-
-@torch.inference_mode()
-def find_illumination(
-    gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float
-) -> Illumination:
-    """Find surfaces, the sky and openness from views."""
-    up, ahead = world_axes(cameras)
-    shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
-    count = min(_VIEWS, len(cameras))
-    chosen = cameras.select(torch.linspace(0, len(cameras) - 1, count).round().long())
-    chosen = chosen.scaled(max(1.0, float(chosen.size.amax()) / _VIEW_PIXELS))
-    pinholes = [covering(chosen, view, near) for view in range(count)]
-    surfaces = find_surfaces(*shape, pinholes, up=up, antialiased=antialiased)
-    bulk = bulk_of(gaussians.means.numpy())
-    far = torch.from_numpy(bulk.apart > _MAX_BLOCKER_DISTANCE)
-    eyes = cameras.pose[:, :, 3].float().mean(0)
-    heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ up
-    above = heights > MIN_SKY_HEIGHT
-    far = far | (above & _behind_ground(gaussians.means, ~above))
-    sky = far & above
-    # Half of the views tell as much: on the town all of them are 0.02 dB worse, and take 0.6 s more for a plant.
-    like, followed, spread = _seen_again(gaussians, surfaces, far, sky, pinholes[::2], up, antialiased)
-    far = far | sky | ((like > _MIN_LIKENESS) & above)
-    sky = sky | ((torch.maximum(like, followed) > _MIN_LIKENESS) & above)
-    # A training may put bare asphalt far too deep; its surface is where the markings around are.
-    beyond = sky | torch.from_numpy(bulk.distances(surfaces.points.numpy()) > _MAX_BLOCKER_DISTANCE)
-    covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
-    blockers = Blockers(gaussians.means[~far], covariances[~far], gaussians.opacities[~far])
-    found = Illumination(
-        surfaces,
-        blockers,
-        spread,
-        torch.ones(len(gaussians)),
-        far,
-        beyond,
-        sky,
-        heights,
-        up,
-        ahead,
-        gaussians.colours,
-    )
-    open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
-    return replace(found, openness=torch.where(beyond, torch.ones(()), open_))
-
-
-def _behind_ground(means: Annotated[Tensor, "N 3"], below: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
-    """What lies far outside of all that is below the horizon, bool: where a third of a capture's Gaussians are of the
-    sky, they count for its bulk.
-    """
-    if not bool(below.any()):
-        return below
-    ground = bulk_of(means[below].numpy())
-    return torch.from_numpy(ground.distances(means.numpy()) > _MIN_SKY_DISTANCE)
-
-
-def _seen_again(
-    gaussians: Gaussians,
-    surfaces: Surfaces,
-    far: Annotated[Tensor, "N"],
-    sky: Annotated[Tensor, "N"],
-    cameras: Sequence[Pinhole],
-    up: Annotated[Tensor, "3"],
-    antialiased: bool,
-) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
-    """Both likenesses to the sky of the pixels that show a Gaussian (`sky_pixels`), in [0, 1], and the thickness of the
-    surface there: the mean distance of what they show from it.
-    """
-    shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
-    away = ((surfaces.points - gaussians.means) * surfaces.normals).sum(1).abs()
-    away = torch.minimum(away, _MAX_SPREAD_SHARE * surfaces.widths)
-    values = torch.stack([sky.float(), torch.where(far, torch.zeros(()), away)], 1)
-    sums = torch.zeros(len(gaussians), 4)
-    for camera in cameras:
-        drawn = draw(gaussians, camera, antialiased=antialiased, features=values)
-        inside = drawn.features / drawn.opacity.clamp_min(1e-3)[..., None]
-        sure = torch.where(drawn.opacity > 0.5, inside[..., 0], torch.zeros(()))
-        like, followed = sky_pixels(drawn.image.clamp(0, 1), sure, camera, up)
-        pixels = torch.stack([like, followed, inside[..., 1], torch.ones_like(like)], -1)
-        sums += lift(*shape, camera, pixels.contiguous(), antialiased=antialiased)
-    found = sums[:, :3] / sums[:, 3:].clamp_min(_MIN_SHOWN_PIXELS)
-    return found[:, 0], found[:, 1], found[:, 2]
 
 
 def relit_harmonics(

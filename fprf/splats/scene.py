@@ -31,6 +31,7 @@ from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
 from .drawing import SeenMeans, draw, seen_means
+from .find_light import find_illumination
 from .gaussians import GaussianRows, Gaussians
 from .kept_light import kept_illumination
 from .levels import Levels, StyledLevels
@@ -40,7 +41,6 @@ from .relighting import (
     azimuth_note,
     captured_light_note,
     facing_north,
-    find_illumination,
     mixed_gain,
     relit_harmonics,
 )

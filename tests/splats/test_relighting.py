@@ -24,9 +24,10 @@ from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.drawing import draw
 from fprf.splats.files import read_capture, write_gaussians
+from fprf.splats.find_light import find_illumination
 from fprf.splats.gaussians import Gaussians, joined
 from fprf.splats.pinholes import camera_of
-from fprf.splats.relighting import facing_north, find_illumination, relit_harmonics
+from fprf.splats.relighting import facing_north, relit_harmonics
 from fprf.splats.scene import SplatScene, illuminated, with_illumination
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import save_dictionary
