@@ -1,6 +1,8 @@
 """The light of a page in a headless Chromium. Skipped where playwright or Chromium are not there."""
 
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,9 @@ from test_page_in_browser import drawn, inside, opened, pixels, psnr, rasterised
 from fprf.light.day import day as hours_of
 from fprf.page.pack import pack
 from fprf.page.suns import packed_day
+from fprf.rendering.north import North
 from fprf.splats.relighting import relit_harmonics
+from fprf.splats.scene import with_illumination
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 SUNS = 5
@@ -90,7 +94,7 @@ def shown(page: Any) -> Any:
 
 def test_the_sun_is_dragged_and_moved_by_keys(page: Any) -> None:
     before = beside(page)
-    assert shown(page)["name"] == "captured"
+    assert shown(page)["name"] == "captured" and page.locator("#north").text_content() == ""
     dome = page.locator("#dome").bounding_box()
     x = dome["x"] + dome["width"] / 2
     y = dome["y"] + dome["height"] / 2
@@ -119,6 +123,33 @@ def test_the_sun_is_dragged_and_moved_by_keys(page: Any) -> None:
     assert np.abs(beside(page) - before).max() < 2 / 255
     page.evaluate("(link) => { location.hash = link; }", link)
     assert shown(page)["hour"] == 16
+
+
+def test_north_is_marked_on_the_dome_and_noon_is_in_the_south(browser: Any, tmp_path: Path) -> None:
+    scene = seen(ball(2000, 1))
+    north = North(direction=(0.6, 0.0, -0.8), source="a compass", southern=False)
+    scene = with_illumination(replace(scene, north=north))
+    page = opened(browser, written(tmp_path / "page.html", scene, suns=SUNS), 1000, 700)
+    page.keyboard.press("l")
+    page.wait_for_function("() => document.getElementById('north').textContent === 'N'")
+    dome = page.locator("#dome").bounding_box()
+    letter = page.locator("#north").bounding_box()
+    x = letter["x"] + letter["width"] / 2 - dome["x"] - dome["width"] / 2
+    y = letter["y"] + letter["height"] / 2 - dome["y"] - dome["height"] / 2
+    heading = page.evaluate("() => fprf.stage.light.panel.headed()")
+    assert math.hypot(x, y) == pytest.approx(0.4 * dome["width"], abs=4)
+    assert (math.degrees(math.atan2(x, -y)) + heading + 180) % 360 - 180 == pytest.approx(0, abs=4)
+    # What one looks at lies as far from north as the scene says.
+    ahead = torch.tensor(page.evaluate("() => fprf.place.camera.axes[2]"))
+    found = scene.light_found
+    looked = ahead - torch.dot(ahead, found.up) * found.up
+    azimuth = found.degrees_of(torch.nn.functional.normalize(looked, dim=0))[0]
+    assert (azimuth - heading + 180) % 360 - 180 == pytest.approx(0, abs=0.5)
+    page.get_by_role("button", name="Noon").click()
+    assert abs(shown(page)["at"][0]) == pytest.approx(180, abs=0.1)
+    assert "from north" in page.locator("#sun").get_attribute("aria-valuetext")
+    assert page.errors == []
+    page.close()
 
 
 def test_no_strength_is_the_scene_as_captured(page: Any) -> None:

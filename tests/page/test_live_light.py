@@ -8,13 +8,17 @@ from splat_ball import ball
 from test_light_in_browser import beside
 from test_live_page import front, served, state
 
+from fprf.rendering.north import Bearings
 from fprf.splats.files import write_gaussians
+from fprf.splats.gaussians import GaussianRows
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def test_the_sun_of_a_server_is_dragged_on_its_dome(tmp_path: Path) -> None:
-    write_gaussians(tmp_path / "ball.ply", ball(2000, 1))
+    rows = ball(2000, 1)
+    bearings = Bearings((0.6, 0.0, -0.8), (0.0, -1.0, 0.0))
+    write_gaussians(tmp_path / "ball.ply", GaussianRows(2000, rows.select, True, bearings))
     with served(tmp_path / "ball.ply", "--output", str(tmp_path / "made")) as address, front(address) as page:
         before = beside(page)
         page.locator("#light").click()
@@ -30,6 +34,12 @@ def test_the_sun_of_a_server_is_dragged_on_its_dome(tmp_path: Path) -> None:
         sun = state(page, "state.sun.sun !== null && state.sun.sun[1] < 33")["sun"]["sun"]
         heading = page.evaluate("() => fprf.live.sun.panel.headed()")
         assert (sun[0] - heading) % 360 == pytest.approx(90, abs=4) and sun[1] == pytest.approx(31, abs=4)
+        # A sun that counts from the first view is shown where it stands.
+        first = page.evaluate("() => fprf.live.sun.first")
+        old = {"light": None, "sun": [10.0, 30.0], "from": "view", "strength": 1}
+        there = page.evaluate("(sun) => { fprf.live.state.sun = sun; return fprf.live.sun.light; }", old)
+        assert abs(first) > 1 and (there["sun"][0] - first) % 360 == pytest.approx(10)
+        assert page.locator("#north").text_content() == "N"
         page.wait_for_function("() => fprf.stage.to === 'Now' && fprf.place.splats.lights.has('Now')")
         lit = beside(page)
         assert np.abs(lit - before).mean() > 0.005
