@@ -16,6 +16,7 @@ from PIL.ExifTags import IFD, Base
 from raw_files import dng
 
 from fprf.datamanagers.images import load_image
+from fprf.datamanagers.positions import read_position
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
@@ -50,19 +51,28 @@ def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, 
     assert all(dropped.values())
 
 
-def with_lens(path: Path, **options: object) -> Path:
-    """A photograph whose EXIF block, with an orientation, names its camera and its focal length."""
+HERE = {1: "S", 2: (33.0, 54.0, 3.6), 3: "E", 4: (18.0, 24.0, 0.0)}
+"""A position in an EXIF block."""
+BLACK = np.zeros((8, 12, 3), np.uint8)
+
+
+def with_lens(path: Path, pixels: np.ndarray = BLACK, **options: object) -> Path:
+    """A photograph whose EXIF block, with an orientation, names its camera, its focal length and its position."""
     exif = Image.Exif()
     exif[Base.Model], exif[Base.Orientation] = "Phone 9", 6
     exif.get_ifd(IFD.Exif).update({Base.FocalLength: 4.25, Base.FocalLengthIn35mmFilm: 26})
-    exif[IFD.Exif] = exif.get_ifd(IFD.Exif)  # else TIFF would be without
-    Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=exif, **options)
+    exif.get_ifd(IFD.GPSInfo).update(HERE)
+    for part in (IFD.Exif, IFD.GPSInfo):
+        exif[part] = exif.get_ifd(part)  # else TIFF would be without
+    Image.fromarray(pixels).save(path, exif=exif, **options)
     return path
 
 
 def test_the_lens_is_read_from_every_format_and_no_lens_is_an_empty_one(tmp_path: Path) -> None:
     for suffix in ("jpg", "png", "webp", "tif", "avif"):
-        assert read_lens(with_lens(tmp_path / f"lens.{suffix}")) == Lens("Phone 9", 4.25, 26)
+        path = with_lens(tmp_path / f"lens.{suffix}")
+        assert read_lens(path) == Lens("Phone 9", 4.25, 26)
+        assert read_position(path) == pytest.approx((-33.901, 18.4, 0.0))
     (tmp_path / "text.jpg").write_text("no image")
     for path in (
         photo(tmp_path / "a.jpg"),
@@ -222,6 +232,18 @@ def test_what_colmap_does_not_read_becomes_jpeg_whatever_it_is_called(tmp_path: 
                 32,
                 3,
             )
+
+
+def test_photographs_keep_their_positions(tmp_path: Path) -> None:
+    source = tmp_path / "in"
+    source.mkdir()
+    for k, suffix in enumerate(("jpg", "webp", "tif")):
+        with_lens(source / f"{k}.{suffix}", np.roll(NOISE, 8 * k, 1))
+    place = SceneFolder(tmp_path / "scene")
+    state = gathered(source, place)
+    assert list(state.images) == ["0.jpg", "1.webp.jpg", "2.tif"]
+    for name in state.images:
+        assert read_position(place.images / name) == pytest.approx((-33.901, 18.4, 0.0))
 
 
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
