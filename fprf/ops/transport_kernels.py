@@ -89,9 +89,10 @@ def project(counters, gaussians, frame, blur, out):
             hh = d0 * frame[2, 0] + d1 * frame[2, 1] + d2 * frame[2, 2]
             # What is thinner than the blur is widened and made fainter, so that it takes as much light away.
             sharp = max(xx * yy - xy * xy, np.float32(0))
+            # Of long needles the widened products cancel in float32; this sum does not.
+            det = max(sharp + blur * (xx + yy) + blur * blur, np.float32(1e-30))
             xx += blur
             yy += blur
-            det = xx * yy - xy * xy
             opacity = opacities[i] * math.sqrt(sharp / det)
             h = frame[2, 0] * p[0] + frame[2, 1] * p[1] + frame[2, 2] * p[2]
             row = out[i]

@@ -164,3 +164,19 @@ def test_openness_is_that_of_what_stands_around() -> None:
     blockers = Blockers(wall, covariances_of(turns, sizes), torch.full((len(wall),), 0.95))
     half = float(openness(blockers, point, UP[None], UP, 0.1 * ones, 0.1 * ones))
     assert 0.4 < half < 0.65
+
+
+@pytest.mark.parametrize("blur", [0.0, 0.03])
+def test_long_needles_are_no_fault(blur: float) -> None:
+    # The product of their widths across the light is the difference of two numbers a thousand million times as large.
+    draw = torch.Generator().manual_seed(0)
+    turns = torch.randn(4000, 4, generator=draw)
+    sizes = torch.tensor([5.3, -9.0, -9.0]).repeat(4000, 1)
+    needles = Blockers(
+        torch.randn(4000, 3, generator=draw), covariances_of(turns, sizes), torch.full((4000,), 0.9)
+    )
+    points = torch.randn(50, 3, generator=draw) - torch.tensor([0.0, 0.0, 5.0])
+    ones = torch.full((50,), 0.01)
+    for light in torch.nn.functional.normalize(torch.randn(8, 3, generator=draw), dim=1):
+        found = transport(needles, points, frame_of(light), ones, ones, blur)
+        assert bool(found.isfinite().all()) and 0 <= float(found.min()) and float(found.max()) <= 1
