@@ -179,4 +179,4 @@ def test_long_needles_are_no_fault(blur: float) -> None:
     ones = torch.full((50,), 0.01)
     for light in torch.nn.functional.normalize(torch.randn(8, 3, generator=draw), dim=1):
         found = transport(needles, points, frame_of(light), ones, ones, blur)
-        assert bool(found.isfinite().all()) and 0 <= float(found.min()) and float(found.max()) <= 1
+        assert bool(found.isfinite().all()) and float(found.min()) >= 0 and float(found.max()) <= 1
