@@ -59,8 +59,6 @@ def find_illumination(
     like, followed, spread = _seen_again(gaussians, surfaces, far, sky, pinholes[::2], up, antialiased)
     far = far | sky | ((like > _MIN_LIKENESS) & above)
     sky = sky | ((torch.maximum(like, followed) > _MIN_LIKENESS) & above)
-    # A training may put bare asphalt far too deep; its surface is where the markings around are.
-    beyond = sky | torch.from_numpy(bulk.distances(surfaces.points.numpy()) > _MAX_BLOCKER_DISTANCE)
     blockers = blockers_of(gaussians, far)
     found = Illumination(
         surfaces,
@@ -68,7 +66,6 @@ def find_illumination(
         spread,
         torch.ones(len(gaussians)),
         far,
-        beyond,
         sky,
         heights,
         up,
@@ -76,7 +73,7 @@ def find_illumination(
         gaussians.colours,
     )
     open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
-    return replace(found, openness=torch.where(beyond, torch.ones(()), open_))
+    return replace(found, openness=torch.where(sky, torch.ones(()), open_))
 
 
 def blockers_of(gaussians: Gaussians, far: Annotated[Tensor, "N"]) -> Blockers:

@@ -21,11 +21,11 @@ from .find_light import blockers_of, find_illumination
 from .gaussians import Gaussians
 from .relighting import Illumination
 
-_LIGHT_CACHE_VERSION = 4
+_LIGHT_CACHE_VERSION = 5
 """Of what is found: it counts up whenever the same scene gives something else."""
 _MAX_KEPT_SCENES = 24
 """Scenes of which the cache keeps it, 56 bytes a Gaussian each."""
-_PARTS = ("spread", "openness", "far", "beyond", "sky", "heights", "up", "ahead")
+_PARTS = ("spread", "openness", "far", "sky", "heights", "up", "ahead")
 """Fields of an illumination that are kept beside its surfaces."""
 
 
@@ -75,7 +75,7 @@ def _read(path: Path, gaussians: Gaussians) -> Illumination | None:
     try:
         kept = load_sealed(path)
         surfaces = Surfaces(*(kept[name] for name in Surfaces._fields))
-        spread, openness, far, beyond, sky, heights, up, ahead = (kept[name] for name in _PARTS)
+        spread, openness, far, sky, heights, up, ahead = (kept[name] for name in _PARTS)
     except (CheckpointError, KeyError):
         return None
     with suppress(OSError):  # another process may just have removed it
@@ -90,7 +90,6 @@ def _read(path: Path, gaussians: Gaussians) -> Illumination | None:
         spread,
         openness,
         far,
-        beyond,
         sky,
         heights,
         up,

@@ -60,8 +60,6 @@ class Illumination:
     openness: Annotated[Tensor, "N"]
     far: Annotated[Tensor, "N"]
     """Gaussians that cast no shadows, bool."""
-    beyond: Annotated[Tensor, "N"]
-    """Those whose surfaces no shadow falls on, bool: skies, and what lies far out."""
     sky: Annotated[Tensor, "N"]
     """Those of the sky, bool."""
     heights: Annotated[Tensor, "N"]
@@ -129,7 +127,7 @@ class Illumination:
         found = torch.zeros(len(points))
         for place in places:
             found += transport(self.blockers, points, frame_of(place, self.up), offset, offset, self.blur)
-        return torch.where(self.beyond, torch.ones(()), found / len(places))
+        return torch.where(self.sky, torch.ones(()), found / len(places))
 
     @cached_property
     def azimuth(self) -> float:
@@ -156,7 +154,7 @@ class Illumination:
         """The one of some azimuths, the first of equals, from which most of what the views show is lit."""
         some = slice(None, None, max(1, len(self.far) // _TRIED_GAUSSIANS))
         surfaces = Surfaces(*(part[some] for part in self.surfaces))
-        weights = torch.where(self.beyond[some], torch.zeros(()), surfaces.weights)
+        weights = torch.where(self.sky[some], torch.zeros(()), surfaces.weights)
         points = self.points[some]
         offset = self.offset[some]
         best = azimuths[0]
@@ -182,7 +180,7 @@ class Illumination:
         return thinned(self, torch.arange(0, len(self.far), every), every)._sought_sun()
 
     def _sought_sun(self) -> CapturedSun | None:
-        shown = torch.where(self.beyond, torch.zeros(()), self.surfaces.weights).nonzero()[:, 0]
+        shown = torch.where(self.sky, torch.zeros(()), self.surfaces.weights).nonzero()[:, 0]
         if len(shown) < _MIN_TRIED_GAUSSIANS:
             return None
         # By what the views show of them, and so evenly over pictures.
@@ -299,7 +297,6 @@ def thinned(illumination: Illumination, rows: Annotated[Tensor, "n"], every: int
         spread=kept.spread[rows],
         openness=kept.openness[rows],
         far=kept.far[rows],
-        beyond=kept.beyond[rows],
         sky=kept.sky[rows],
         heights=kept.heights[rows],
         colours=kept.colours[rows],
