@@ -10,6 +10,7 @@ from typing import Annotated, NamedTuple
 import torch
 from kornia.color import lab_to_rgb, rgb_to_lab
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from fprf.datamanagers.basis import Basis
 from fprf.errors import DataError
@@ -22,7 +23,16 @@ from fprf.style.dictionary import StyleDictionary
 from fprf.style.light import light_of
 from fprf.style.look import Restyle, colour_maps, decoded_colours, region_maps
 from fprf.style.placed_light import placed_light
-from fprf.style.placing import VIEW_SAMPLES, Landmarks, ViewSamples, blurred, view_keypoints
+from fprf.style.placing import (
+    VIEW_SAMPLES,
+    Keypoints,
+    Landmarks,
+    ViewSamples,
+    blurred,
+    close_keypoints,
+    close_size,
+    view_keypoints,
+)
 from fprf.style.scene_style import SceneStyle, scene_style
 from fprf.types import Want
 
@@ -131,7 +141,13 @@ def flat_landmarks(image: Annotated[Tensor, "H W 3"], semantic: Annotated[Tensor
     at = torch.arange(0, height * width, max(1, height * width // VIEW_SAMPLES))
     pixel = torch.stack([at % width, at // width], 1) + 0.5
     samples = ViewSamples(pixel, blurred(image).flatten(0, 1)[at], semantic[at])
-    return Landmarks((view_keypoints(image),), lambda view: samples)
+
+    def closer(view: int) -> Keypoints:
+        pixels = image.permute(2, 0, 1)[None]
+        larger = interpolate(pixels, close_size((width, height))[::-1], mode="bicubic")[0].permute(1, 2, 0)
+        return close_keypoints(larger.clamp(0, 1), (width, height))
+
+    return Landmarks((view_keypoints(image),), lambda view: samples, closer)
 
 
 @torch.no_grad()

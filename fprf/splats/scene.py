@@ -26,7 +26,15 @@ from ..rendering.renderer import enlarged
 from ..scenes import Scene, SceneView, Values
 from ..style.dictionary import Encoders
 from ..style.look import Restyle
-from ..style.placing import VIEW_SAMPLES, Landmarks, ViewSamples, blurred
+from ..style.placing import (
+    VIEW_SAMPLES,
+    Keypoints,
+    Landmarks,
+    ViewSamples,
+    blurred,
+    close_keypoints,
+    close_size,
+)
 from ..style.scene_style import SceneStyle
 from ..training.camera_optimizers import Tones
 from ..types import Origin, View
@@ -362,7 +370,16 @@ class SplatScene(Scene):
             pixel = torch.stack([at % camera.width, at // camera.width], 1) + 0.5
             return ViewSamples(pixel, colour[at], semantic[at])
 
-        return Landmarks(seen.keypoints, samples)
+        @torch.inference_mode()
+        def closer(view: int) -> Keypoints:
+            """Keypoints of a view that is drawn larger, in its own pixels."""
+            width, height = seen.cameras.size[view].tolist()
+            camera = camera_of(seen.cameras.scaled(width / close_size((width, height))[0]), view, self.near)
+            return close_keypoints(
+                draw(self.gaussians, camera, antialiased=self.antialiased).image, (width, height)
+            )
+
+        return Landmarks(seen.keypoints, samples, closer)
 
 
 def illuminated(scene: SplatScene) -> Illumination:

@@ -31,7 +31,7 @@ from ..io.atomic import write_bytes
 from ..ops.backend import double, float32_convolutions
 from ..ops.config import GuidedConfig
 from ..ops.guided import apply, coefficients
-from .placing import Landmarks, Pairs, find_place
+from .placing import Keypoints, Landmarks, Pairs, close_keypoints, close_size, find_place
 from .statistics import covariance, group_moments, kmeans, mix, moments
 
 if TYPE_CHECKING:
@@ -124,7 +124,9 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path |
     if encoders.semantic is None or encoders.basis is None:
         return Reference(name, content, content.new_zeros(len(content), 0), colour=colour)
     semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
-    placed = None if encoders.landmarks is None else find_place(encoders.landmarks, image, chosen)
+    placed = None
+    if encoders.landmarks is not None:
+        placed = find_place(encoders.landmarks, image, chosen, lambda: _close_keypoints(cutout, size, chosen))
     return Reference(name, content, semantic, colour=colour, beyond=beyond, placed=placed)
 
 
@@ -155,6 +157,22 @@ def _mostly_covered(cover: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]
     """Cells that are at least half covered, else all that are covered at all."""
     half = cover >= 0.5
     return half if bool(half.any()) else cover > 0
+
+
+def _close_keypoints(
+    cutout: Cutout, size: tuple[int, int], chosen: Annotated[Tensor, "H W"] | None
+) -> Keypoints:
+    """Keypoints of a photograph that is larger than a size (width, height), in pixels of that size; `chosen` as of
+    `_reduced`.
+    """
+    larger = close_size(size)
+    enlarged = larger[0] > cutout.pixels.shape[1]
+    pixels = cv2.resize(cutout.pixels, larger, interpolation=cv2.INTER_CUBIC if enlarged else cv2.INTER_AREA)
+    where = None
+    if chosen is not None:
+        mask = chosen.cpu().numpy().astype(np.uint8)
+        where = torch.from_numpy(cv2.resize(mask, larger, interpolation=cv2.INTER_NEAREST)) > 0
+    return close_keypoints(torch.from_numpy(pixels).float() / 255, size, where)
 
 
 def _grid_pixels(size: tuple[int, int]) -> Annotated[Tensor, "N 2"]:

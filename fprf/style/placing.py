@@ -41,6 +41,24 @@ _MIN_AGREEING_SHARE = 0.42
 """Their share of all matches that the map brings into the photograph: façades that are built alike agree, while
 what is around them does not. Towns of the same houses reach 0.1 to 0.52, one place in two lights 0.43 to 0.98.
 """
+_MIN_SURE_AGREEING = 25
+"""Matches that agree in the best view, from which on nobody looks closer: towns of the same houses reach 17."""
+_MIN_HINT = 5
+"""Matches that agree, with which a view is looked at more closely, where no view has so many."""
+_MAX_HINTS = 3
+"""Views that are looked at more closely: each is drawn again."""
+_CLOSE_SIDE_PIXELS = 640
+"""Longer side of views and photographs at a closer look: at twice 160 pixels towns of the same houses have 0.35 of
+their matches agree, at four times 0.23.
+"""
+_CLOSE_KEYPOINTS = 1500
+"""Keypoints of a view and of a photograph at a closer look, at most."""
+_MIN_CLOSE_AGREEING = 12
+"""Matches that agree at a closer look, at least: of unrelated photographs 8 do at most."""
+_MIN_CLOSE_SHARE = 0.25
+"""Their share of all matches that the map brings into the photograph: 48 pictures of towns of the same houses reach
+0.23, one place from two sides 0.23 to 0.51.
+"""
 _MIN_VIEW_SHARE = 0.5
 """Share of the best view's agreeing matches that other views need: fewer mean another side of the place, where
 one affine map does not hold.
@@ -85,6 +103,10 @@ class Landmarks(NamedTuple):
     keypoints: tuple[Keypoints, ...]
     samples: Callable[[int], ViewSamples]
     """Samples of a view by its number: asked for where it shows what a photograph does."""
+    closer: Callable[[int], Keypoints] | None = None
+    """`close_keypoints` of a view by its number, drawn larger: asked for where matches are too few to tell; None =
+    nobody looks.
+    """
 
 
 class Pairs(NamedTuple):
@@ -103,11 +125,28 @@ class Registration(NamedTuple):
     matrix: Annotated[Tensor, "2 3"]
     """(x, y, 1) of the first to (x, y) of the second picture, float64."""
     agreeing: int
+    share: float
+    """Their share of the matches that the map brings into the second picture."""
 
 
 def view_keypoints(image: Annotated[Tensor, "H W 3"]) -> Keypoints:
     """The keypoints of a view that are kept."""
     return find_keypoints(image, _VIEW_KEYPOINTS)
+
+
+def close_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Width and height of a view or photograph of a size at a closer look: never smaller."""
+    scale = max(1.0, _CLOSE_SIDE_PIXELS / max(size))
+    return round(scale * size[0]), round(scale * size[1])
+
+
+def close_keypoints(
+    image: Annotated[Tensor, "H W 3"], size: tuple[int, int], where: Annotated[Tensor, "H W"] | None = None
+) -> Keypoints:
+    """The keypoints of a picture of a `close_size`, at positions of the picture at its `size` (width, height)."""
+    found = find_keypoints(image, _CLOSE_KEYPOINTS, where)
+    smaller = torch.tensor([size[0] / image.shape[1], size[1] / image.shape[0]])
+    return found._replace(position=found.position * smaller)
 
 
 def find_keypoints(
@@ -149,14 +188,14 @@ def matches(
 
 
 def register(
-    a: Annotated[Tensor, "N 2"], b: Annotated[Tensor, "N 2"], size: tuple[int, int]
+    a: Annotated[Tensor, "N 2"], b: Annotated[Tensor, "N 2"], size: tuple[int, int], least: int
 ) -> Registration | None:
-    """The affine map that most matched positions agree with; None where too few do.
+    """The affine map that most matched positions agree with; None where less than `least` do.
 
     `size` is width and height of the second picture.
     """
     tolerance = _TOLERANCE_SHARE * max(size)
-    if len(a) < _MIN_AGREEING:
+    if len(a) < least:
         return None
     similar, agrees = cv2.estimateAffinePartial2D(
         a.numpy(),
@@ -166,25 +205,25 @@ def register(
         maxIters=_HYPOTHESES,
         confidence=0.999,
     )
-    if similar is None or int(agrees.sum()) < _MIN_AGREEING:
+    if similar is None or int(agrees.sum()) < least:
         return None
     scale = float(abs(np.linalg.det(similar[:, :2])) ** 0.5)
     if not 1 / _MAX_SCALE < scale < _MAX_SCALE:
         return None
-    best = Registration(torch.from_numpy(np.asarray(similar, dtype=np.float64)), int(agrees.sum()))
+    best = torch.from_numpy(np.asarray(similar, dtype=np.float64))
+    agreeing = int(agrees.sum())
     # A façade is seen from another side: six numbers instead of four, where they hold for as many matches.
     near = torch.from_numpy(agrees[:, 0] > 0)
     x = torch.cat([a.double(), a.new_ones(len(a), 1).double()], 1)
     for _ in range(_REFINEMENTS):
         matrix = torch.linalg.lstsq(x[near], b[near].double(), driver="gelsd").solution.T
         near = (x @ matrix.T - b.double()).norm(dim=1) < tolerance
-        if int(near.sum()) < best.agreeing:
+        if int(near.sum()) < agreeing:
             break
-        best = Registration(matrix, int(near.sum()))
-    landed = _within(x @ best.matrix.T, size)
-    if best.agreeing < _MIN_AGREEING_SHARE * int(landed.sum()):
-        return None
-    return best
+        best = matrix
+        agreeing = int(near.sum())
+    landed = _within(x @ best.T, size)
+    return Registration(best, agreeing, agreeing / max(1, int(landed.sum())))
 
 
 def _within(at: Annotated[Tensor, "N 2"], size: tuple[int, int]) -> Annotated[Tensor, "N"]:
@@ -196,33 +235,71 @@ def find_place(
     landmarks: Landmarks,
     image: Annotated[Tensor, "H W 3"],
     where: Annotated[Tensor, "H W"] | None = None,
+    closer: Callable[[], Keypoints] | None = None,
 ) -> Pairs | None:
     """Colours of a scene and of a photograph that shows the very place; None where it shows another.
 
-    Only pixels that are `where` (bool; None = all) count.
+    Only pixels that are `where` (bool; None = all) count. `closer` are the `close_keypoints` of the photograph, asked
+    for where views have some matches, but too few to be sure; None = nobody looks.
     """
-    height, width = image.shape[:2]
-    photograph = find_keypoints(image, _PHOTOGRAPH_KEYPOINTS, where)
-    there = photograph.descriptor.float()
+    size = (image.shape[1], image.shape[0])
+    known = _registered(landmarks, find_keypoints(image, _PHOTOGRAPH_KEYPOINTS, where), size)
     found = []
-    for view, keypoints in enumerate(landmarks.keypoints):
-        first, second = matches(keypoints.descriptor.float(), there)
-        known = register(keypoints.position[first], photograph.position[second], (width, height))
-        if known is not None:
-            found.append((known, view))
+    for each, view in known:
+        if each.agreeing >= _MIN_AGREEING and each.share >= _MIN_AGREEING_SHARE:
+            found.append((each, view))
+    sure = bool(found) and found[0][0].agreeing >= _MIN_SURE_AGREEING
+    if known and not sure and closer is not None and landmarks.closer is not None:
+        found = _closely_registered(
+            landmarks.closer, [view for _, view in known[:_MAX_HINTS]], closer(), size
+        )
     if not found:
         return None
-    found.sort(key=lambda each: -each[0].agreeing)
     least = _MIN_VIEW_SHARE * found[0][0].agreeing
     parts = []
     smooth = blurred(image)
-    for known, view in found[:_MAX_VIEWS]:
-        if known.agreeing >= least:
-            parts.append(_seen_in(landmarks.samples(view), known, smooth, where))
+    for each, view in found[:_MAX_VIEWS]:
+        if each.agreeing >= least:
+            parts.append(_seen_in(landmarks.samples(view), each, smooth, where))
     own, shown, semantic = (torch.cat(each) for each in zip(*parts, strict=True))
     if len(own) == 0:
         return None
     return Pairs(own, shown, semantic, found[0][0].agreeing)
+
+
+def _registered(
+    landmarks: Landmarks, photograph: Keypoints, size: tuple[int, int]
+) -> list[tuple[Registration, int]]:
+    """Maps from views to a photograph of a size (width, height) that some matches agree with, and the views' numbers:
+    those with most first.
+    """
+    there = photograph.descriptor.float()
+    found = []
+    for view, keypoints in enumerate(landmarks.keypoints):
+        first, second = matches(keypoints.descriptor.float(), there)
+        known = register(keypoints.position[first], photograph.position[second], size, _MIN_HINT)
+        if known is not None:
+            found.append((known, view))
+    return sorted(found, key=lambda each: -each[0].agreeing)
+
+
+def _closely_registered(
+    closer: Callable[[int], Keypoints], views: Sequence[int], photograph: Keypoints, size: tuple[int, int]
+) -> list[tuple[Registration, int]]:
+    """The same of some views at a closer look, of those that show the place.
+
+    A place from another side, or by night, has a few matches that agree, as towns of the same houses have; the larger
+    both are drawn, the more of its matches do, and the fewer of theirs.
+    """
+    there = photograph.descriptor.float()
+    found = []
+    for view in views:
+        keypoints = closer(view)
+        first, second = matches(keypoints.descriptor.float(), there)
+        known = register(keypoints.position[first], photograph.position[second], size, _MIN_CLOSE_AGREEING)
+        if known is not None and known.share >= _MIN_CLOSE_SHARE:
+            found.append((known, view))
+    return sorted(found, key=lambda each: -each[0].agreeing)
 
 
 def _seen_in(

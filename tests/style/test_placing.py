@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from fprf.errors import CheckpointError
 from fprf.io.images import to_uint8, write_image
@@ -30,6 +31,8 @@ from fprf.style.placing import (
     Landmarks,
     Pairs,
     ViewSamples,
+    close_keypoints,
+    close_size,
     find_keypoints,
     find_place,
     keypoint_tensors,
@@ -84,6 +87,44 @@ def test_a_part_of_the_place_in_another_light_is_found_to_the_pixel() -> None:
 def test_another_place_is_not_found(seed: int) -> None:
     assert find_place(landmarks(picture(0)), picture(seed)) is None
     assert find_place(landmarks(picture(0)), torch.full((*SIZE, 3), 0.5)) is None, "nor is nothing"
+
+
+def test_few_matches_are_looked_at_more_closely() -> None:
+    """Where a view has some matches, but too few to be sure, both sides are compared at a larger size: it decides."""
+    image = picture(0)
+    shown = relit(image)
+    few = find_keypoints(image, 20)
+    height, width = SIZE
+    larger = close_size((width, height))
+    assert larger == (640, 480) and close_size((1000, 20)) == (1000, 20)
+
+    def enlarged(picture: Tensor) -> Keypoints:
+        pixels = picture.permute(2, 0, 1)[None]
+        return close_keypoints(
+            interpolate(pixels, larger[::-1], mode="bicubic")[0].permute(1, 2, 0), (width, height)
+        )
+
+    samples = landmarks(image).samples
+    assert find_place(Landmarks((few,), samples), picture(1), closer=lambda: enlarged(picture(1))) is None
+    asked = []
+
+    def closer(view: int) -> Keypoints:
+        asked.append(view)
+        return enlarged(image)
+
+    known = find_place(Landmarks((few,), samples, closer), shown, closer=lambda: enlarged(shown))
+    assert known is not None and asked == [0] and known.agreeing > 40
+    # Positions are those of the small pictures: what is shown is the same spot in its light.
+    apart = (known.shown - relit(known.own)).abs().mean()
+    anywhere = (known.shown.flip(0) - relit(known.own)).abs().mean()
+    assert float(apart) < 0.3 * float(anywhere)
+    # What differs at a closer look is another place, though some matches agree.
+    assert find_place(Landmarks((few,), samples, closer), shown, closer=lambda: enlarged(picture(1))) is None
+    # Many matches need no closer look.
+    asked.clear()
+    everything = Landmarks((view_keypoints(image),), samples, closer)
+    assert find_place(everything, shown, closer=lambda: enlarged(shown)) is not None
+    assert not asked
 
 
 def test_what_a_mask_leaves_out_is_not_compared() -> None:
