@@ -113,21 +113,25 @@ def read(
     *,
     views: int = 32,
     up: Sequence[float] | None = None,
+    north: Sequence[float] | None = None,
     inside: bool | None = None,
     activated: bool = False,
 ) -> "FinishedCapture":
     """A finished capture of 3D Gaussians, ready to restyle and write: a file of any format that is installed.
 
-    `views`, `up` and `inside` are those of `fprf restyle`: how it is looked at. `activated` reads numbers that
+    `views`, `up`, `north` and `inside` are those of `fprf restyle`: how it is looked at. `activated` reads numbers that
     look activated already as such; `capture.notes` of what is returned says where they do. Raises DataError
     where it cannot be read.
     """
     from .api import FinishedCapture
     from .io.paths import as_path
     from .plugins.conversion import three_numbers
+    from .splats.captures import with_asked_north
     from .splats.config import LookConfig
     from .splats.files import read_capture
 
     direction = None if up is None else three_numbers("up", up)
-    look = LookConfig(views=views, up=direction, inside=inside, activated=activated)
-    return FinishedCapture(read_capture(as_path(path), activated=activated), look)
+    there = None if north is None else three_numbers("north", north)
+    look = LookConfig(views=views, up=direction, north=there, inside=inside, activated=activated)
+    capture = read_capture(as_path(path), activated=activated)
+    return FinishedCapture(with_asked_north(capture, look), look)

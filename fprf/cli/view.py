@@ -42,6 +42,8 @@ class ViewConfig(QualityConfig):
     """Direction that points up in a capture's own axes; none = as the file says, else away from its ground,
     else 0 -1 0.
     """
+    north: tuple[float, float, float] | None = None
+    """Direction of north in a capture's own axes; none = as the file says, else not known."""
     activated: bool = False
     """Read opacities, sizes and colours of a capture that look activated already as such; one line says where
     they do.
@@ -173,7 +175,7 @@ def _load(
         name = name or viewed.name
         return replace(viewed, name=name, style=style, references=config.references, pixels=config.pixels)
     from ..page.messages import READ_SHARE, SEARCHED_SHARE
-    from ..splats.captures import FINDING_VIEWS, open_capture
+    from ..splats.captures import FINDING_VIEWS, open_capture, with_asked_north
     from ..splats.config import LookConfig
     from ..splats.files import read_capture
 
@@ -191,8 +193,13 @@ def _load(
     for note in capture.notes:
         say(f"{capture.path}: {note}")
     look = LookConfig(
-        up=config.up, inside=config.inside, activated=config.activated, semantic=config.semantic
+        up=config.up,
+        north=config.north,
+        inside=config.inside,
+        activated=config.activated,
+        semantic=config.semantic,
     )
+    capture = with_asked_north(capture, look)
     wait("opening", f"{path.name}: {len(capture.gaussians):,} Gaussians are read", READ_SHARE)
     scene = open_capture(capture, look, progress=progress, say=say)
     name = name or path.resolve().name.partition(".")[0]

@@ -28,13 +28,14 @@ from ..io.images import to_uint8, write_image
 from ..io.tensorfiles import load_sealed, save_kept
 from ..ops.rasterise import MIN_ALPHA
 from ..rendering.cameras import Cameras
+from ..rendering.north import North
 from ..scenes import Scene
 from ..training.loading import open_run
 from ..types import Origin
 from .config import LookConfig
 from .drawing import clip_distance
 from .files import Capture, read_capture, release
-from .files.base import pieces
+from .files.base import direction_of, pieces
 from .gaussians import Gaussians, bulk_of
 from .ground import USUAL_UP, Direction, axis_name, find_ground
 from .neighbours import Neighbours, sampled
@@ -88,6 +89,16 @@ def with_direction_up(look: LookConfig, capture: Capture, say: Callable[[str], N
     up, reason = direction_up(capture)
     say(f"{capture.path}: up is {axis_name(up)}: {reason} (--up says otherwise)")
     return replace(look, up=up)
+
+
+def with_asked_north(capture: Capture, look: LookConfig) -> Capture:
+    """A capture with north where it is asked to be. Raises DataError for what is no direction."""
+    if look.north is None:
+        return capture
+    direction = direction_of(look.north)
+    if direction is None:
+        raise DataError(f"north {look.north}: no direction; give three numbers, not all 0")
+    return replace(capture, north=North(direction=direction, source="--north says so"))
 
 
 def look_at_capture(
@@ -159,6 +170,7 @@ def open_capture(
     found here, and features, which are then stored, when they are first asked for. `cache` is the folder; by
     default the user's own.
     """
+    capture = with_asked_north(capture, look)
     look = with_direction_up(look, capture, say)
     encoder = look.semantic.encoder.build()
     path = (cache or cache_folder("captures")) / _cache_name(capture, look, encoder)
@@ -372,7 +384,7 @@ def _read(path: Path, look: LookConfig, say: Callable[[str], None]) -> Capture:
     capture = read_capture(path, activated=look.activated)
     for note in capture.notes:
         say(f"{capture.path}: {note}")
-    return capture
+    return with_asked_north(capture, look)
 
 
 def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:

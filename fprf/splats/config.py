@@ -54,6 +54,10 @@ class LookConfig:
     """Direction that points up in the capture's own axes; none = as the file says, else away from its ground,
     else 0 -1 0: most captures have y down. One line says which.
     """
+    north: tuple[float, float, float] | None = None
+    """Direction of north in the capture's own axes; none = as the file says, else not known: azimuths of suns count
+    from the direction of the first view.
+    """
     inside: bool | None = None
     """Look from within, as in rooms and streets, or around an object; none = found out."""
     views: int = 32

@@ -11,9 +11,11 @@ import pytest
 import torch
 from splat_ball import ball
 
+import fprf
 from fprf.datamanagers.scene import ParsedScene
+from fprf.errors import DataError
 from fprf.rendering.north import Bearings, North
-from fprf.splats.captures import direction_up, open_capture
+from fprf.splats.captures import direction_up, open_capture, with_asked_north
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_capture, write_gaussians
 from fprf.splats.gaussians import GaussianRows, Gaussians
@@ -134,6 +136,18 @@ def test_a_capture_that_is_turned_as_a_whole_keeps_its_north(tmp_path: Path) -> 
     # With y down east lies to the right of north as x to that of z: of x and z (-0.8, -0.6).
     wanted = math.degrees(math.atan2(-0.8 * 1 - 0.6 * 2, 0.6 * 1 - 0.8 * 2))
     assert angles[0][0] == pytest.approx(wanted, abs=1e-2)
+
+
+def test_north_is_where_the_user_says(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "a.ply", told(ball(500)))
+    capture = read_capture(tmp_path / "a.ply")
+    look = LookConfig(views=4, size=(64, 48), north=(0.0, 0.0, 5.0))
+    scene = open_capture(capture, look, cache=tmp_path / "cache")
+    assert scene.north is not None and scene.north.direction == (0, 0, 1)
+    read = fprf.read(tmp_path / "a.ply", north=[1, 0, 0])
+    assert read.capture.north is not None and read.capture.north.direction == (1, 0, 0)
+    with pytest.raises(DataError, match="north"):
+        with_asked_north(capture, replace(look, north=(0.0, 0.0, 0.0)))
 
 
 def test_facts_of_a_run_keep_north(scene: ParsedScene) -> None:
