@@ -46,6 +46,10 @@ BENCHMARKS = {
         "--folder {folder}/pairs --seeds 0",
         "the pairs of WxBS 1.1; without them it is skipped",
     ),
+    "edges": Benchmark(
+        "codes that pixels at the borders of a town's things take, against their true classes",
+        "--runs 1 --steps 40 --views 1 --palettes night",
+    ),
     "exports": Benchmark(
         "exported files drawn again, against the scene's own renders", "{run} --views 1", _TRAINED
     ),

@@ -39,6 +39,11 @@ _MAX_SEMANTIC_VIEWS = 32
 """Training views that semantics are found in, at most; by eye, as `LookConfig.views`."""
 _FOLLOWED_SHARE = 4
 """Of a scene in training semantics are found in so many times fewer views, so that looks follow it; by eye."""
+_MAX_SEMANTIC_ENLARGEMENT = 2.0
+"""Times that small photographs are enlarged at most, so that the encoder sees things as large as in others:
+from 160 pixels to 240, pixels at the borders of things match right on 3 in 100 more; more shows nothing but
+blur.
+"""
 _LEVELS_FOLDER = "levels"
 """Folder of a run that holds its levels of detail."""
 _MIN_MAPPED_GAUSSIANS = 400_000
@@ -89,6 +94,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
     else:
         count = _MAX_SEMANTIC_VIEWS
         side = config.semantic_size
+    reduction = max(1 / _MAX_SEMANTIC_ENLARGEMENT, float(known.cameras.size.amax()) / side)
     encoder = functools.cache(config.semantic.encoder.build)
 
     def found() -> Semantics:
@@ -111,7 +117,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         views = known.cameras.select(
             every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
         )
-        views = views.scaled(max(1.0, float(views.size.amax()) / side))
+        views = views.scaled(reduction)
         semantics = find_semantics(gaussians, True, encoder(), views, config.regions, near=near)
         if not training:
             marks = {}
@@ -146,7 +152,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         view_names=known.names,
         found=functools.cache(found),
         encoder=encoder,
-        longest=min(side, int(known.cameras.size.amax())),
+        longest=round(int(known.cameras.size.amax()) / reduction),
         near=near,
         background=config.background,
         origin=known.facts.origin,

@@ -38,7 +38,7 @@ from .gaussians import MAX_BULK_DISTANCE, Gaussians, bulk_of, cells_of
 from .levels import seen_by
 from .pinholes import camera_of
 
-SEMANTICS_VERSION = 1
+SEMANTICS_VERSION = 2
 """Of how semantics are found: it counts up whenever the same Gaussians and views give others."""
 _SEMANTIC_COMPONENTS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors
@@ -53,9 +53,9 @@ _STATISTICS_PIXELS = 65_536
 _WINDOW_REACH = 1
 """Cells of the encoder beside one whose colours explain its features: with 2 fewer pixels at borders match
 right."""
-_MIN_CELL_VARIANCE = 1e-4
-"""Variance of the colours of cells, below which they hardly explain features: a fiftieth of a channel's range.
-With ten times as much fewer pixels at borders match right."""
+_MIN_CELL_VARIANCE = 1e-5
+"""Variance of the colours of cells, below which they hardly explain features: a 300th of a channel's range.
+With ten times as much fewer pixels at borders match right, with a tenth of it no more."""
 _SPREAD_COMPONENTS = 8
 """Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
 _NEIGHBOURHOOD_PIXELS = 1.0
