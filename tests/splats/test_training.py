@@ -325,6 +325,8 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
         assert (folder / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
     plain, other = (open_run(folder, "cpu").scene for folder in (run, tmp_path / "other"))
     assert plain.semantic_encoder == SEMANTICS.build().identity and len(plain.measured()[0].share) > 3
+    # Small photographs are looked at enlarged, twice at most, and never above what was asked for.
+    assert plain.longest == 2 * int(plain.cameras.size.amax()) and other.longest == 32
     encoder = RandomConfig(channels=6).build().identity
     assert (
         other.semantic_encoder == other.encoders().semantic.identity == encoder
