@@ -66,7 +66,7 @@ def _degrees(parts: Sequence[object], letter: object, letters: str) -> float:
     """Degrees, minutes and seconds as degrees. Raises ValueError for a letter that is none of the two."""
     if isinstance(letter, bytes):
         letter = letter.decode()
-    side = letters.index(str(letter).strip("\0 ").upper())
+    side = [*letters].index(str(letter).strip("\0 ").upper())
     total = 0.0
     for part, unit in zip(parts, (1, 60, 3600), strict=True):
         total += float(part) / unit  # type: ignore[arg-type]
@@ -103,7 +103,7 @@ def north_of(
     accuracy = max(USUAL_ACCURACY_METRES, float(found[:, 2].median()))
     fit = fit_north(places, metres_from(found[:, 0], found[:, 1]), up, accuracy)
     by = f"positions (GPS) of {fit.kept} photographs"
-    if math.isinf(fit.uncertainty):
+    if math.isinf(fit.uncertainty) and fit.extent > 0:
         return f"{by} of {count} agree with the cameras' places, all others contradict"
     if fit.uncertainty > MAX_UNCERTAINTY_DEGREES:
         turn = f"{fit.uncertainty:.0f} degrees" if fit.uncertainty < _MAX_SAID_DEGREES else "any angle"

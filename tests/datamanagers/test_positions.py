@@ -14,7 +14,7 @@ from PIL.ExifTags import GPS, IFD, Base
 from raw_files import thumbnail, tiff
 
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.datamanagers.positions import Position, read_position
+from fprf.datamanagers.positions import Position, north_of, read_position
 from fprf.datamanagers.scene import ParsedScene
 from fprf.rendering.north import world_axes
 
@@ -85,6 +85,8 @@ def test_a_position_is_read_from_tiff_and_raw_photographs(tmp_path: Path, raw: b
     [
         {"GPSLatitudeRef": "X"},
         {"GPSLatitudeRef": None},
+        {"GPSLatitudeRef": ""},
+        {"GPSLongitudeRef": "\0"},
         {"GPSLatitude": (91.0, 0.0, 0.0)},
         {"GPSLongitude": (181.0, 0.0, 0.0)},
         {"GPSLatitude": (55.0, 41.0)},
@@ -155,6 +157,12 @@ def test_a_scene_without_positions_or_with_too_few_says_no_north(tmp_path: Path)
     walked(tmp_path / "short", LUND, 0.0, length=3.0, noise=3.0)
     scene = parse_scene(tmp_path / "short", 1, None)
     assert scene.north is None and any("north: not known" in note for note in scene.notes)
+
+
+def test_positions_that_are_all_one_contradict_no_other() -> None:
+    places = torch.eye(3).repeat(4, 1)
+    said = north_of(places, [LUND] * 12, torch.tensor([0.0, 0.0, 1.0]))
+    assert isinstance(said, str) and "over 0 m" in said and "contradict" not in said
 
 
 def test_a_reconstruction_of_odm_says_north_where_it_has_a_reference(tmp_path: Path) -> None:
