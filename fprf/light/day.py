@@ -1,8 +1,7 @@
 """A day: where the sun stands from dawn to dusk. No torch.
 
-The sun goes along a great circle, clockwise as seen from above or, south of the equator, the other way round, and stands
-highest at 12 o'clock. An hour turns
-it by 15 degrees.
+The sun goes along a great circle, clockwise as seen from above or, south of the equator, the other way round, and
+stands highest at 12 o'clock. An hour turns it by 15 degrees.
 """
 
 import math

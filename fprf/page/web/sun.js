@@ -67,7 +67,7 @@ const lumaOf = (colour) => 0.2126 * colour[0] + 0.7152 * colour[1] + 0.0722 * co
 const bluenessOf = (colour) => Math.log(colour[2] / colour[0]);
 
 /**
- * Factors of colours + 0.055 of a Gaussian of the sky, as `Illumination.sky_gain` computes them.
+ * Factors of colours + 0.055 of a Gaussian of the sky, as `CapturedSky.gain` computes them.
  * @param {number[]} own linear
  * @param {number} u sine of its height
  * @param {number[]} horizon
