@@ -187,8 +187,8 @@ class SplatScene(Scene):
 
     @property
     def light_notes(self) -> tuple[str, ...]:
-        """A line about the light of the capture, for a look that changes it, and one about azimuths, where some are
-        given or said.
+        """A line about the light of the capture, for a look that changes it, and lines about azimuths and north, where
+        some are given or said.
         """
         look = self.look
         if look is None or not look.lit:
@@ -199,6 +199,8 @@ class SplatScene(Scene):
         notes = [captured_light_note(sun, unlit=unlit)]
         configs = [config for _, config in look.lights]
         if sun is not None or any(config is not None and config.place is not None for config in configs):
+            if self.north is not None and found.north is None:
+                notes.append(f"north is passed over, as it is not level: {self.north.source}")
             notes.append(azimuth_note(None if found.north is None else self.north, configs))
         return tuple(notes)
 

@@ -178,7 +178,10 @@ def test_the_sun_stands_in_the_south_at_noon_or_south_of_the_equator_in_the_nort
     assert scene.light_found.noon == scene.light_found.azimuth and scene.light_found.clockwise
     # A direction that points up is none.
     x, y, z = scene.light_found.up.tolist()
-    assert facing_north(scene.light_found, North(direction=(x, y, z))).north is None
+    above = North(direction=(x, y, z), source="a wrong compass")
+    assert facing_north(scene.light_found, above).north is None
+    notes = lit(replace(scene, north=above), SunConfig(sun=(-90.0, 35.0))).light_notes
+    assert "not level: a wrong compass" in notes[1] and "first view" in notes[2]
 
 
 def in_the_sun(scene: SplatScene, sun: tuple[float, float]) -> SplatScene:
