@@ -28,6 +28,10 @@ farther out, four scenes from within have theirs at 0.6 and more (by eye).
 """
 _MIN_SKY_DISTANCE = 2.0
 """Distance of a sky from the bulk of what lies below the horizon, at least: walls of a street reach 1.8."""
+_MIN_GROUND_SHARE = 0.1
+"""Of Gaussians that lie below the horizon, at least, for their bulk to be the ground's: of a facade that is seen from
+below a few floaters were, and all of it became sky.
+"""
 _MAX_SPREAD_SHARE = 0.2
 """Distance of a Gaussian from its surface that counts for how thick that is, at most, as a share of that width."""
 _MIN_SHOWN_PIXELS = 1e-2
@@ -84,10 +88,10 @@ def blockers_of(gaussians: Gaussians, far: Annotated[Tensor, "N"]) -> Blockers:
 
 def _behind_ground(means: Annotated[Tensor, "N 3"], below: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
     """What lies far outside of all that is below the horizon, bool: where a third of a capture's Gaussians are of the
-    sky, they count for its bulk.
+    sky, they count for its bulk. Nothing where too little is below the horizon.
     """
-    if not bool(below.any()):
-        return below
+    if float(below.float().mean()) < _MIN_GROUND_SHARE:
+        return torch.zeros_like(below)
     ground = bulk_of(means[below].numpy())
     return torch.from_numpy(ground.distances(means.numpy()) > _MIN_SKY_DISTANCE)
 

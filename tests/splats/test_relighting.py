@@ -398,6 +398,21 @@ def test_a_sky_of_most_gaussians_casts_no_shadows() -> None:
     assert float(known.openness[:1000].mean()) > 0.5
 
 
+def test_a_facade_over_a_few_floaters_is_no_sky() -> None:
+    made = yard(2000)
+    draw_ = torch.Generator().manual_seed(0)
+    facade = 2 + 30 * torch.rand(2000, 3, generator=draw_)
+    facade[:, 1] = 10.0
+    facade[:5] = 0.1 * torch.rand(5, 3, generator=draw_)
+    eye = torch.tensor([[14.0, 0.0, 1.6], [20.0, 0.0, 1.6]]).double()
+    views = look_at(
+        eye, torch.tensor([[17.0, 10.0, 12.0]]).double().expand(2, 3), torch.tensor([0.0, 0.0, 1.0]).double()
+    )
+    cameras = pinhole(views, width=64, height=48, fov=80)
+    known = find_illumination(replace(made, means=facade), cameras, antialiased=False, near=0.05)
+    assert not bool(known.sky.any()) and not bool(known.far[5:].any())
+
+
 def test_shadows_fall_on_ground_that_a_training_left_too_deep() -> None:
     made = yard(4000)
     cameras = around_the_yard().select(torch.tensor([0]))
