@@ -21,7 +21,7 @@ from .find_light import blockers_of, find_illumination
 from .gaussians import Gaussians
 from .relighting import Illumination
 
-_LIGHT_CACHE_VERSION = 5
+_LIGHT_CACHE_VERSION = 6
 """Of what is found: it counts up whenever the same scene gives something else."""
 _MAX_KEPT_SCENES = 24
 """Scenes of which the cache keeps it, 56 bytes a Gaussian each."""
