@@ -85,8 +85,9 @@ STEP = """async ([t, [from, to], width, height]) => {
   while (place.sorting) await new Promise((done) => setTimeout(done, 5));
   const keys = scene.cameras.slice(from, to + 1).map((each) => new Camera(each)), at = t * (keys.length - 1);
   const key = Math.min(Math.floor(at), keys.length - 2), camera = keys[key].towards(keys[key + 1], at - key);
-  [canvas.width, canvas.height] = [width, height];
   await splats.sort(camera.view, scene.near);
+  // Not before: the page fits its canvas to the window once more.
+  [canvas.width, canvas.height] = [width, height];
   return stage.styles.slice(0, 5).map(({ name }) => {
     splats.draw(camera.view, camera.fitted(width, height), { first: name }, scene);
     return canvas.toDataURL("image/png");
