@@ -6,12 +6,14 @@ import importlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
+from io import BytesIO
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
+import PIL.Image
 
 from ..errors import DataError, UsageError
 from .atomic import atomic_path, unwritable, write_bytes, write_json
@@ -25,10 +27,12 @@ if TYPE_CHECKING:
 Codec = Literal["h264", "mp4v", "gif", "webp", "apng"]
 _ANIMATED_FORMATS: dict[str, tuple[Codec, str, list[int]]] = {
     ".gif": ("gif", ".gif", [cv2.IMWRITE_GIF_QUALITY, 8, cv2.IMWRITE_GIF_DITHER, 1]),
-    ".webp": ("webp", ".webp", [cv2.IMWRITE_WEBP_QUALITY, 84]),
+    ".webp": ("webp", ".webp", []),
     ".apng": ("apng", ".png", []),
 }
 """Animated pictures by ending: their format, the ending that OpenCV knows it by, and its options."""
+_WEBP_QUALITY = 84
+"""Of 100, as of single pictures (`fprf.io.images`)."""
 FILMS = (".mp4", *_ANIMATED_FORMATS)
 """Endings of the films that can be written."""
 _X264_OPTIONS = {"crf": "17", "preset": "medium"}
@@ -152,11 +156,36 @@ def _animated(path: Path, frames: list[Picture], fps: float) -> Codec:
     for k in range(len(frames)):
         ends.append(round(1000 * (k + 1) / fps / unit) * unit)
     film.durations = [end - start for start, end in pairwise([0, *ends])]
+    if kind == "webp":
+        write_bytes(path, _webp(frames, film.durations))
+        return kind
     done, data = cv2.imencodeanimation(ending, film, options)
     if not done:
         raise DataError(f"{path}: OpenCV cannot write it here; write an .mp4, or a folder")
     write_bytes(path, data.tobytes())
     return kind
+
+
+def _webp(frames: list[Picture], milliseconds: Sequence[int]) -> bytes:
+    """An animated picture that starts over at its end, of frames that are whole.
+
+    OpenCV leaves out the blocks of a frame that differ little from the frame before, each time: in a sky that changes
+    slowly squares of long ago are left.
+    """
+    first, *others = [PIL.Image.fromarray(frame) for frame in frames]
+    file = BytesIO()
+    first.save(
+        file,
+        "WEBP",
+        save_all=True,
+        append_images=others,
+        duration=list(milliseconds),
+        loop=0,
+        quality=_WEBP_QUALITY,
+        kmin=0,
+        kmax=1,
+    )
+    return file.getvalue()
 
 
 _FRAMES_RECORD = ".render.json"

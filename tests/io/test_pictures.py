@@ -209,6 +209,21 @@ def test_a_film_reads_back(tmp_path: Path, h264: bool, size: tuple[int, int]) ->
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_sky_that_changes_slowly_leaves_no_squares(tmp_path: Path) -> None:
+    # A frame changes the sky by less than an encoder takes for a change, and something moves below it.
+    frames = []
+    for step in range(41):
+        sky = np.full((64, 96, 3), 60 + step, np.uint8)
+        sky[48:, 2 * step : 2 * step + 16] = 240
+        frames.append(sky)
+    write_video(tmp_path / "sky.webp", iter(frames), fps=10)
+    done, film = cv2.imreadanimation(str(tmp_path / "sky.webp"))
+    assert done and len(film.frames) == 41
+    for frame, wanted in zip(film.frames, frames, strict=True):
+        shown = frame[:32, :, 2::-1].astype(int)
+        assert np.abs(shown - wanted[:32]).max() <= 4
+
+
 @pytest.mark.parametrize(("ending", "far"), [(".gif", 12), (".webp", 8), (".apng", 0)])
 def test_animated_pictures_read_back(tmp_path: Path, ending: str, far: int) -> None:
     path = tmp_path / f"film{ending}"
