@@ -80,7 +80,7 @@ class Scene(ABC):
 
     @property
     def north(self) -> "North | None":
-        """Where north lies in its world; None where nothing tells it."""
+        """Direction of north in its world; None if nothing tells it."""
         return None
 
     @property

@@ -47,7 +47,7 @@ class Position(NamedTuple):
 
 
 def read_position(path: Path) -> Position | None:
-    """Where a photograph was taken by its EXIF block; None where that says nothing, or nothing sound."""
+    """Position of a photograph by its EXIF block; None if that says nothing, or nothing sound."""
     try:
         with path.open("rb") as file:
             block = exif_of(file, path).get_ifd(IFD.GPSInfo)

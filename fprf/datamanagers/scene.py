@@ -56,7 +56,7 @@ class ParsedScene:
     notes: tuple[str, ...] = ()
     """Decisions taken while the capture was read, a line each, for the user."""
     north: North | None = None
-    """Where north lies, where the capture says it or the positions of its photographs tell it."""
+    """Direction of north, if the capture says it or the positions of its photographs tell it."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Subtracted from the capture's coordinates, along its own axes: cameras and points are relative to
     it.

@@ -45,18 +45,18 @@ _WGS84_ECCENTRICITY_SQUARED = 0.00669438
 
 @dataclass(frozen=True, kw_only=True)
 class North:
-    """Where north lies in a scene."""
+    """Direction of north in a scene, and its source."""
 
     direction: tuple[float, float, float]
     """Of length 1, in the axes of the scene's world."""
     source: str = ""
-    """What tells it, as a phrase."""
+    """A phrase that says from what it is known."""
     southern: bool | None = None
     """The scene lies south of the equator; None = not known."""
 
 
 class Bearings(NamedTuple):
-    """What a file of Gaussians says of the directions of its world."""
+    """Directions of north and up in the world of a file of Gaussians."""
 
     north: tuple[float, float, float]
     up: tuple[float, float, float] | None

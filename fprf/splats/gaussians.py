@@ -173,7 +173,7 @@ class GaussianRows:
     antialiased: bool
     """Opacities are compensated for the width that drawing adds (Mip-Splatting)."""
     bearings: Bearings | None = None
-    """Where north and up are, for a file to say; None where nothing tells it."""
+    """Directions of north and up, for a file to say; None if nothing tells them."""
 
 
 def from_arrays(

@@ -99,7 +99,7 @@ class SplatScene(Scene):
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the Gaussians and the views."""
     north: North | None = None
-    """Where north lies; None where nothing tells it."""
+    """Direction of north; None if nothing tells it."""
     tones: Tones | None = None
     """Exposures of the views, where a run has learnt them."""
     poses: Callable[[ParsedScene, Sequence[int]], Annotated[Tensor, "V 6"]] | None = None

@@ -59,7 +59,7 @@ class Facts:
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the local frame that all of the run is in (see `rendering.local_frame`)."""
     north: North | None = None
-    """Where north lies, where the capture tells it."""
+    """Direction of north, if the capture tells it."""
     field: FieldFacts | None = None
     """Facts of its fields; None where it is made of something else."""
 

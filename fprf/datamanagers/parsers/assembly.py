@@ -52,7 +52,7 @@ class CaptureContents:
     reduced: bool = False
     """Images are copies, of one shape with the cameras, that may each be reduced by a factor of its own."""
     north: North | None = None
-    """Where north lies, where the capture says so."""
+    """Direction of north, if the capture says it."""
     notes: Sequence[str] = ()
     """Decisions that were taken while it was read."""
 

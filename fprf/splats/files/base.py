@@ -79,7 +79,7 @@ class Capture:
     up_reason: str = ""
     """Source of that, as a phrase."""
     north: North | None = None
-    """Where north lies, where the file says so."""
+    """Direction of north, if the file says it."""
     camera: Cameras | None = None
     """The view that the capture was made from, where the file holds it."""
     shift: Origin = (0.0, 0.0, 0.0)

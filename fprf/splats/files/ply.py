@@ -160,7 +160,7 @@ class _Comments(NamedTuple):
     vertical: str
     """The vertical axis; empty where no line says it."""
     north: str
-    """Where north is; empty where no line says it."""
+    """Numbers of the line of north; empty if there is none."""
     nerfstudio: bool
     brush: bool
 
