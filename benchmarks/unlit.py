@@ -69,11 +69,11 @@ def main(argv: list[str]) -> int:
         with tempfile.TemporaryDirectory(prefix="fprf-unlit-") as made:
             rows.append(_row(config, seed, Path(made)))
         print(rows[-1], flush=True)
-    names = ("captured", "unlit", "unlit, clouds")
-    mean = {
-        name: {kind: float(np.mean([row[name][kind] for row in rows])) for kind in ("plain", "gain")}
-        for name in names
-    }
+    mean: dict[str, dict[str, float]] = {}
+    for name in ("captured", "unlit", "unlit, clouds"):
+        mean[name] = {}
+        for kind in ("plain", "gain"):
+            mean[name][kind] = float(np.mean([row[name][kind] for row in rows]))
     nearer = {kind: mean["unlit, clouds"][kind] - mean["captured"][kind] for kind in ("plain", "gain")}
     print({"mean": mean, "nearer": nearer})
     report(config.output, {"towns": rows, "mean": mean, "nearer": nearer})
