@@ -1,4 +1,4 @@
-"""What is found out once about the light on Gaussians: surfaces, what casts shadows, the sky and its openness."""
+"""Surfaces of Gaussians, their blockers of light, the sky and its openness: found once for all lights."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -81,13 +81,13 @@ def find_illumination(
 
 
 def blockers_of(gaussians: Gaussians, far: Annotated[Tensor, "N"]) -> Blockers:
-    """What casts shadows: all but those that are far."""
+    """Gaussians that cast shadows: all but those that are far."""
     covariances = covariances_of(gaussians.quaternions, gaussians.log_scales)
     return Blockers(gaussians.means[~far], covariances[~far], gaussians.opacities[~far])
 
 
 def _behind_ground(means: Annotated[Tensor, "N 3"], below: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
-    """What lies far outside of all that is below the horizon, bool: where a third of a capture's Gaussians are of the
+    """Gaussians far outside of all that is below the horizon, bool: where a third of a capture's Gaussians are of the
     sky, they count for its bulk. Nothing where too little is below the horizon.
     """
     if float(below.float().mean()) < _MIN_GROUND_SHARE:
