@@ -397,7 +397,7 @@ def capture_file(path: Path) -> Iterator[Finding]:
     """Format, Gaussians, what points up and how numbers are meant of a capture. Raises DataError where it
     cannot be read.
     """
-    from ..splats.captures import direction_up
+    from ..splats.capture_alignment import axes_of
     from ..splats.files import read_capture
     from ..splats.ground import axis_name
 
@@ -411,8 +411,8 @@ def capture_file(path: Path) -> Iterator[Finding]:
     else:
         remedy = ""
     yield Finding("gaussians", said, remedy, optional=True)
-    up, reason = direction_up(capture)
-    yield Finding("up", f"{axis_name(up)}: {reason}; --up says otherwise")
+    axes = axes_of(capture)
+    yield Finding("up", f"{axis_name(axes.up)}: {axes.reason}; --up says otherwise")
     if capture.north is not None:
         yield Finding("north", f"{axis_name(capture.north.direction)}: {capture.north.source}")
     # The last note of a capture that looks activated says that, too.

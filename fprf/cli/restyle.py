@@ -241,7 +241,7 @@ def _write_captures(
         for one, out in zip(made, files[number] if files else (), strict=False):
             display.count(done, steps, "restyling")
             harmonics = seen.harmonics(number, capture, one.scene)
-            written = write_capture(out.capture, capture, harmonics, seen.scene.views)
+            written = write_capture(out.capture, capture, harmonics, seen.views_of(number, capture))
             write_style(out.style, one.styled.controls.saved)
             faulty = written.faulty
             if len(files) > 1:

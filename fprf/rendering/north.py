@@ -25,6 +25,8 @@ USUAL_ACCURACY_METRES = 3.0
 walk to the other: what of that is in proportion to the way hides in the fit. A street of 200 m by a phone: its halves, of
 60 and 106 m, are turned by 2.5 degrees either way.
 """
+_MIN_LEVEL_PART = 0.3
+"""Level part of a direction of north, at least: of less nothing is left once it is made level (by eye)."""
 _MIN_INDEPENDENT_FIXES = 2.0
 """Positions whose errors are independent, at least, however alike those of neighbours are."""
 _MIN_KEPT_SHARE = 0.6
@@ -95,6 +97,16 @@ def bearings_of(cameras: Cameras, north: North | None) -> Bearings | None:
         return None
     x, y, z = world_axes(cameras)[0].tolist()
     return Bearings(north.direction, (x, y, z))
+
+
+def level_direction(
+    direction: Annotated[Tensor, "3"], up: Annotated[Tensor, "3"]
+) -> Annotated[Tensor, "3"] | None:
+    """The level direction of length 1 of another; None where that points up or down. `up` is of length 1."""
+    level = direction - (direction @ up) * up
+    if float(level.norm()) < _MIN_LEVEL_PART:
+        return None
+    return torch.nn.functional.normalize(level, dim=0)
 
 
 def metres_from(

@@ -89,8 +89,8 @@ def _own_side(captures: Captures) -> _Side:
     """The captures, each where it is in the world."""
     own = captures.scene.gaussians
     means = own.means.clone()
-    for rows, moved in zip(captures.rows, captures.moved, strict=True):
-        means[rows] -= moved
+    for rows, placement in zip(captures.rows, captures.placements, strict=True):
+        means[rows] = placement.back(means[rows])
     return _Side(means, _log_light(own.colours), own.opacities.double())
 
 

@@ -10,7 +10,6 @@ memory.
 
 import functools
 import hashlib
-import itertools
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -32,12 +31,13 @@ from ..rendering.north import North
 from ..scenes import Scene
 from ..training.loading import open_run
 from ..types import Origin
+from .capture_alignment import UNMOVED, Placement, axes_of, joined_world
 from .config import LookConfig
 from .drawing import clip_distance
 from .files import Capture, read_capture, release
 from .files.base import direction_of, pieces
-from .gaussians import Gaussians, bulk_of
-from .ground import USUAL_UP, Direction, axis_name, find_ground
+from .gaussians import Gaussians
+from .ground import USUAL_UP
 from .neighbours import Neighbours, sampled
 from .relighting import relit_harmonics
 from .restyle import restyled_harmonics
@@ -63,32 +63,15 @@ _MIN_REFERENCE_OPACITY = 0.95
 """Of pixels of such views that count: of others a part is background."""
 MAX_REFERENCE_VIEWS = 16
 """Views of a capture that are references, at most: more say the same again (by eye)."""
-_ROW_GAP = 0.1
-"""Distance between captures that would overlap, as a share of their width, where they are put in a row."""
-_MIN_OVERLAP = 0.5
-"""Of the sides of the smaller one of two boxes, from which on captures lie in one place: neighbours overlap
-by less.
-"""
-
-
-def direction_up(capture: Capture) -> tuple[Direction, str]:
-    """Direction up in a capture, as its file says or as its ground shows, and what tells it, in words."""
-    if capture.up is not None:
-        return capture.up, capture.up_reason or "the file says so"
-    ground = find_ground(capture.gaussians.drawable())
-    # A slab at +z is a wall, as photographs along z see it; no program has its captures stand on one.
-    if ground is None or ground.up == (0.0, 0.0, -1.0):
-        return USUAL_UP, "as in most captures, since nothing in this one tells it"
-    return ground.up, str(ground)
 
 
 def with_direction_up(look: LookConfig, capture: Capture, say: Callable[[str], None]) -> LookConfig:
     """Views of a capture with a direction up, which is said where it was not asked for."""
     if look.up is not None:
         return look
-    up, reason = direction_up(capture)
-    say(f"{capture.path}: up is {axis_name(up)}: {reason} (--up says otherwise)")
-    return replace(look, up=up)
+    axes = axes_of(capture)
+    say(axes.note)
+    return replace(look, up=axes.up)
 
 
 def with_asked_north(capture: Capture, look: LookConfig) -> Capture:
@@ -166,7 +149,7 @@ def open_capture(
 ) -> SplatScene:
     """A capture as a scene: its Gaussians that can be drawn, with views and features from the cache.
 
-    What points up is as `look` says, else as `direction_up`. Where views and features are absent, views are
+    What points up is as `look` says, else as `axes_of`. Where views and features are absent, views are
     found here, and features, which are then stored, when they are first asked for. `cache` is the folder; by
     default the user's own.
     """
@@ -247,8 +230,8 @@ class Captures:
     """A sample of all of them, about the origin of the first one."""
     rows: tuple[slice, ...]
     """Rows of each capture among the Gaussians of the scene."""
-    moved: tuple[Annotated[Tensor, "3"], ...]
-    """Offset of the means of each capture, so that none lies in another's place."""
+    placements: tuple[Placement, ...]
+    """Place of each capture in the scene, so that none lies in another's, and up and north are one."""
     first: Capture
     """The first capture, as it was read."""
     count: int
@@ -275,7 +258,7 @@ class Captures:
         if look.lit:
             found = torch.cat([found.float(), styled.light_gain[rows]], 1)
         # The sample stands where its own capture was moved to: back in its place.
-        near = Neighbours(self.scene.gaussians.means[rows] - self.moved[index], found)
+        near = Neighbours(self.placements[index].back(self.scene.gaussians.means[rows]), found)
         out = torch.empty_like(gaussians.harmonics)
         for some in pieces(len(out)):
             taken = near(means[some])
@@ -284,6 +267,11 @@ class Captures:
                 part = relit_harmonics(part, taken[:, channels:].float())
             out[some] = part
         return out
+
+    def views_of(self, index: int, capture: Capture) -> Cameras:
+        """The views of the scene about the origin of capture number `index`, in its axes."""
+        placed = self.placements[index].cameras_back(self.scene.views)
+        return placed.shifted(moved_origin(capture.origin, self.scene.origin).tolist())
 
 
 def open_captures(
@@ -305,29 +293,36 @@ def open_captures(
     if len(paths) == 1 and len(first.gaussians) <= sample:
         scene = open_capture(first, look, cache=cache, progress=progress, say=say)
         whole = (slice(0, len(scene.gaussians)),)
-        return Captures(scene, whole, (torch.zeros(3),), first, len(first.gaussians))
+        return Captures(scene, whole, (UNMOVED,), first, len(first.gaussians))
     samples = []
+    axes = []
     for path in paths:
         if path == paths[0]:
             capture = first
         else:
             capture = _read(path, look, say)
         samples.append(_sample_of(capture, first.origin, max(1, sample // len(paths))))
+        if len(paths) > 1:
+            axes.append(axes_of(capture, look.up))
         release(capture.data)
     parts = []
     for each in samples:
         parts.append(each.part)
-    moved = _apart(parts)
-    joined = _joined(parts, moved)
-    together = replace(
-        first,
-        gaussians=joined,
-        antialiased=any(each.antialiased for each in samples),
-        data=_joint_key(samples, sample),
-    )
+    placements: tuple[Placement, ...] = (UNMOVED,)
+    together = first
     if len(paths) > 1:
+        world = joined_world(parts, axes)
+        placements = world.placements
         # What lies in one row is looked at as an object; a known camera is that of one capture alone.
-        together = replace(together, camera=None)
+        together = replace(first, camera=None, up=world.up, up_reason=world.up_reason, north=world.north)
+        for note in world.notes:
+            say(note)
+    together = replace(
+        together,
+        gaussians=_joined(parts, placements),
+        antialiased=any(each.antialiased for each in samples),
+        data=_joint_key(samples, sample, placements),
+    )
     scene = open_capture(together, look, cache=cache, progress=progress, say=say)
     rows = []
     start = 0
@@ -335,7 +330,7 @@ def open_captures(
         rows.append(slice(start, start + len(part)))
         start += len(part)
     count = sum(each.total for each in samples)
-    return Captures(scene, tuple(rows), tuple(moved), first, count)
+    return Captures(scene, tuple(rows), placements, first, count)
 
 
 class _Sample(NamedTuple):
@@ -369,11 +364,13 @@ def _sample_of(capture: Capture, origin: Origin, most: int) -> _Sample:
     return _Sample(part, here, digest, len(capture.gaussians), capture.antialiased)
 
 
-def _joint_key(samples: Sequence[_Sample], most: int) -> bytes:
+def _joint_key(samples: Sequence[_Sample], most: int, placements: Sequence[Placement]) -> bytes:
     """Key of the findings about several captures, in the place of a file's content."""
     key = hashlib.sha256(f"{most} {len(samples)}".encode())
-    for each in samples:
+    for each, placement in zip(samples, placements, strict=True):
         key.update(each.digest)
+        if placement.turned:
+            key.update(f"{placement.turn.tolist()} {placement.move.tolist()}".encode())
         if bool(each.here.any()):
             key.update(f"{each.here.tolist()}".encode())  # an offset beside a file moves it among the others
     return key.digest()
@@ -387,51 +384,22 @@ def _read(path: Path, look: LookConfig, say: Callable[[str], None]) -> Capture:
     return with_asked_north(capture, look)
 
 
-def _apart(parts: Sequence[Gaussians]) -> list[Annotated[Tensor, "3"]]:
-    """Offsets that take captures apart, in a row along x, where some lie in one place; nothing where they are
-    neighbours.
-    """
-    boxes = []
-    for part in parts:
-        # Stray Gaussians do not make neighbours of captures that are apart.
-        inner = part.means[torch.from_numpy(bulk_of(part.means.numpy()).apart <= 0.5)]
-        boxes.append((inner.amin(0), inner.amax(0)))
-    if not _overlap(boxes):
-        found: list[Annotated[Tensor, "3"]] = []
-        for _ in parts:
-            found.append(torch.zeros(3))
-        return found
-    moves = []
-    at = 0.0
-    for low, high in boxes:
-        moves.append(torch.tensor([at - float(low[0]), 0.0, 0.0]))
-        at += (1 + _ROW_GAP) * float(high[0] - low[0])
-    return moves
-
-
-def _overlap(boxes: Sequence[tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]]) -> bool:
-    """True where any two boxes, lowest and highest corner, lie in one place."""
-    for (low, high), (other_low, other_high) in itertools.combinations(boxes, 2):
-        shared = (torch.minimum(high, other_high) - torch.maximum(low, other_low)).clamp_min(0)
-        smaller = torch.minimum(high - low, other_high - other_low)
-        if bool((shared > _MIN_OVERLAP * smaller).all()):
-            return True
-    return False
-
-
-def _joined(parts: Sequence[Gaussians], moved: Sequence[Annotated[Tensor, "3"]]) -> Gaussians:
-    """All Gaussians of several, each moved, with as many harmonics as the most of them have."""
+def _joined(parts: Sequence[Gaussians], placements: Sequence[Placement]) -> Gaussians:
+    """All Gaussians of several, each in its place, with as many harmonics as the most of them have."""
     bands = max(part.harmonics.shape[1] for part in parts)
     harmonics = []
-    for part in parts:
+    placed = []
+    for own, placement in zip(parts, placements, strict=True):
+        part = placement.placed(own)
+        placed.append(part)
         # Harmonics of a higher degree are 0 where a file has none.
         missing = part.harmonics.new_zeros(len(part), bands - part.harmonics.shape[1], 3)
         harmonics.append(torch.cat([part.harmonics, missing], 1))
     return Gaussians(
-        means=torch.cat([part.means + by for part, by in zip(parts, moved, strict=True)]),
-        quaternions=torch.cat([part.quaternions for part in parts]),
-        log_scales=torch.cat([part.log_scales for part in parts]),
-        logits=torch.cat([part.logits for part in parts]),
+        means=torch.cat([part.means for part in placed]),
+        quaternions=torch.cat([part.quaternions for part in placed]),
+        log_scales=torch.cat([part.log_scales for part in placed]),
+        logits=torch.cat([part.logits for part in placed]),
         harmonics=torch.cat(harmonics),
     )
 
@@ -480,7 +448,7 @@ def _reference_scene(path: Path, look: LookConfig) -> Scene:
     if (path / "config.json").is_file():
         return open_run(path, device="cpu").scene
     capture = read_capture(path, activated=look.activated)
-    up = look.up or direction_up(capture)[0]
+    up = axes_of(capture, look.up).up
     gaussians = sampled(capture.gaussians.drawable(), SAMPLE)
     encoder = look.semantic.encoder.build()
     look = replace(look, size=_REFERENCE_SIZE, up=up)

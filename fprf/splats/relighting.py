@@ -18,7 +18,7 @@ from ..light.sky import Light, light_of
 from ..light.surfaces import Surfaces
 from ..light.transport import Blockers, disc_directions, frame_of, transport
 from ..ops.harmonics import recoloured
-from ..rendering.north import North
+from ..rendering.north import North, level_direction
 from .restyle import all_around
 
 _OFFSET_SHARE = 0.008
@@ -41,8 +41,6 @@ _MAX_HARD_DEGREES = 1.0
 """Diameter up to which a sun is one place: its shadows are blurred by a sixtieth of their distance at most."""
 _AZIMUTHS = 8
 """Places around that are tried for a sun that nobody has placed."""
-_MIN_LEVEL_NORTH = 0.3
-"""Level part of a direction of north, at least: of less nothing is left once it is made level (by eye)."""
 _TRIED_ELEVATION = 20.0
 """Degrees above the horizon at which they are tried: between golden hour and noon."""
 _TRIED_GAUSSIANS = 8192
@@ -325,11 +323,9 @@ def facing_north(illumination: Illumination, north: North | None) -> Illuminatio
     """An illumination whose azimuths count from north, where that is known."""
     if north is None:
         return illumination
-    there = torch.tensor(north.direction)
-    level = there - (there @ illumination.up) * illumination.up
-    if float(level.norm()) < _MIN_LEVEL_NORTH:
+    level = level_direction(torch.tensor(north.direction), illumination.up)
+    if level is None:
         return illumination
-    level = torch.nn.functional.normalize(level, dim=0)
     turned = replace(illumination, north=level, southern=north.southern)
     suns = []
     for sun in illumination.known_sun:

@@ -15,7 +15,8 @@ import fprf
 from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
 from fprf.rendering.north import Bearings, North
-from fprf.splats.captures import direction_up, open_capture, with_asked_north
+from fprf.splats.capture_alignment import axes_of
+from fprf.splats.captures import open_capture, with_asked_north
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_capture, write_gaussians
 from fprf.splats.gaussians import GaussianRows, Gaussians
@@ -44,7 +45,7 @@ def test_a_file_says_where_north_and_up_are(tmp_path: Path, name: str) -> None:
     write_gaussians(path, told(ball(300)))
     found = read_capture(path)
     assert found.north is not None and found.north.direction == pytest.approx(NORTH, abs=1e-6)
-    assert direction_up(found)[0] == pytest.approx(UP, abs=1e-6)
+    assert axes_of(found).up == pytest.approx(UP, abs=1e-6)
     assert found.north.southern is None and len(found.gaussians) == 300
     # Recoloured in its own format it goes on saying so.
     write_capture(path, found, 0.5 * found.gaussians.harmonics)

@@ -10,7 +10,8 @@ from splat_yard import with_up, yard
 
 from fprf.cli import main as cli
 from fprf.plugins.encoders.config import BundledSemanticConfig
-from fprf.splats.captures import direction_up, look_at_capture
+from fprf.splats.capture_alignment import axes_of
+from fprf.splats.captures import look_at_capture
 from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
@@ -76,7 +77,7 @@ def test_views_stand_above_the_ground(
 ) -> None:
     made = with_up(yard(), turned)
     capture = read_capture(ply(tmp_path / "x.ply", made, comments))
-    found, _ = direction_up(capture)
+    found = axes_of(capture).up
     assert found == UP[up]
     scene = look_at_capture(
         capture.gaussians,
@@ -94,8 +95,8 @@ def test_views_stand_above_the_ground(
 def test_a_wall_is_no_ground(tmp_path: Path) -> None:
     """A facade as photographs along z see it, with things before it."""
     wall = with_up(yard(), "-z")
-    assert direction_up(read_capture(ply(tmp_path / "x.ply", wall)))[0] == UP["-y"]
-    assert direction_up(read_capture(ply(tmp_path / "y.ply", ball(400))))[0] == UP["-y"]
+    assert axes_of(read_capture(ply(tmp_path / "x.ply", wall))).up == UP["-y"]
+    assert axes_of(read_capture(ply(tmp_path / "y.ply", ball(400)))).up == UP["-y"]
 
 
 @pytest.mark.parametrize(("stored", "meant"), [("-y", "-y"), ("+z", "+z"), ("+y", "-y"), ("-z", "+z")])
@@ -107,7 +108,7 @@ def test_a_spz_without_a_word_lies_as_the_ply_that_it_was_made_of(
     wanted = with_up(yard(), meant)
     capture = read_capture(bare_spz(tmp_path / "x.spz", made))
     assert (capture.gaussians.means - wanted.means).abs().max() < 1e-5
-    assert direction_up(capture)[0] == UP[meant]
+    assert axes_of(capture).up == UP[meant]
     assert len(capture.notes) == 1
     # Recoloured, it is understood as before, and in other formats it lies the same.
     write_capture(tmp_path / "y.spz", capture, -capture.gaussians.harmonics)
