@@ -61,6 +61,10 @@ class RunConfig:
 
     data: Path | None = None
     """Scene folder, which must be named; `garden` is the embedded one."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in the capture's own axes; none = as its format says, else as its cameras are held, or
+    against the view of those that look down. Suns, shadows and north count from it; a line says where it is a guess.
+    """
     output: Path | None = None
     """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
     downscale: int | float | None = None

@@ -79,6 +79,11 @@ class Scene(ABC):
         return (0.0, 0.0, 0.0)
 
     @property
+    def up(self) -> "tuple[float, float, float] | None":
+        """Direction up in its world; None = as its cameras are held level."""
+        return None
+
+    @property
     def north(self) -> "North | None":
         """Direction of north in its world; None if nothing tells it."""
         return None

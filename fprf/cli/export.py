@@ -269,7 +269,7 @@ class _Export:
         from ..splats.gaussians import GaussianRows
 
         scene = self.opened.scene
-        bearings = bearings_of(scene.cameras, scene.north)
+        bearings = bearings_of(scene.cameras, scene.north, scene.up)
         limits = Limits(
             minutes=self.config.fit or FIT_MINUTES,
             cap=self.config.fit_cap,

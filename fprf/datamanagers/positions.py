@@ -79,11 +79,11 @@ def with_north(scene: ParsedScene) -> ParsedScene:
     """
     if scene.north is not None:
         return _noted(scene, scene.north.source)
-    placed = _read_positions(scene.paths)
+    placed = read_positions(scene.paths)
     if not placed:
         return scene
     views = [*placed]
-    up, _ = world_axes(scene.cameras)
+    up, _ = world_axes(scene.cameras, scene.up)
     found = north_of(scene.cameras.pose[views, :, 3], [*placed.values()], up)
     if isinstance(found, str):
         return _noted(scene, f"not known: {found}")
@@ -115,7 +115,7 @@ def north_of(
     return North(direction=(x, y, z), source=f"{by}, give or take {near} {unit}", southern=southern)
 
 
-def _read_positions(paths: Sequence[Path]) -> dict[int, Position]:
+def read_positions(paths: Sequence[Path]) -> dict[int, Position]:
     """Positions by view; none where none of the first few that are read has one."""
     views = [*range(0, len(paths), -(-len(paths) // _MAX_READ_FILES))]
     first = views[:: -(-len(views) // _FIRST_FILES)]

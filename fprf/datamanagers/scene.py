@@ -55,6 +55,10 @@ class ParsedScene:
     """Images carry transparency."""
     notes: tuple[str, ...] = ()
     """Decisions taken while the capture was read, a line each, for the user."""
+    up: tuple[float, float, float] | None = None
+    """Direction up of length 1, where the capture says it or cameras that are held alike look down; None = as they are
+    held level.
+    """
     north: North | None = None
     """Direction of north, if the capture says it or the positions of its photographs tell it."""
     origin: Origin = (0.0, 0.0, 0.0)

@@ -22,7 +22,7 @@ def write_shown(path: Path, scene: SplatScene, capture: Capture | None, gaussian
     if capture is not None:
         write_capture(path, capture, gaussians.harmonics, scene.views)
         return
-    bearings = bearings_of(scene.views, scene.north)
+    bearings = bearings_of(scene.views, scene.north, scene.up)
     rows = GaussianRows(len(gaussians), gaussians.select, scene.antialiased, bearings)
     write_gaussians(path, rows, views=scene.views, plain=True, origin=scene.origin)
 

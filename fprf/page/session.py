@@ -240,7 +240,7 @@ class Session:
             # A camera turns about a point as far away as most cameras are from their middle.
             place = scene.cameras.pose[:, :, 3]
             spread = float((place - place.median(dim=0).values).norm(dim=1).quantile(0.9)) or 1.0
-            self.geometry = container(about(scene.cameras, home, lambda view: 1.5 * spread), {})
+            self.geometry = container(about(scene.cameras, home, lambda view: 1.5 * spread, up=scene.up), {})
 
     def hello(self) -> list[tuple[str, dict[str, Any]]]:
         """Messages for a new client."""

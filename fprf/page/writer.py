@@ -256,7 +256,7 @@ def packed_scene(
 
     # Views that were found about an object hold just it, so that its tips lie at their rim.
     found_about = scene.poses is None and _look_inwards(scene.views)
-    place = about(scene.views, start, depth, _BEYOND_FOUND if found_about else 0.0)
+    place = about(scene.views, start, depth, _BEYOND_FOUND if found_about else 0.0, up=scene.up)
     return packed, {**header(packed), **drawing, **place, "styles": styles}, parts
 
 
@@ -266,9 +266,16 @@ def _look_inwards(cameras: Cameras) -> bool:
     return float(((place.mean(0) - place) * -cameras.pose[:, :, 2]).sum(1).mean()) > 0
 
 
-def about(cameras: Cameras, start: int, depth: Callable[[int], float], beyond: float = 0.0) -> dict[str, Any]:
+def about(
+    cameras: Cameras,
+    start: int,
+    depth: Callable[[int], float],
+    beyond: float = 0.0,
+    up: tuple[float, float, float] | None = None,
+) -> dict[str, Any]:
     """Cameras of a scene, that at `start` first, and where one may go; `depth` is the distance that a camera
-    turns about. Cameras count as having seen `beyond` of their frame on each side of it, too.
+    turns about. Cameras count as having seen `beyond` of their frame on each side of it, too. `up` = None takes the
+    cameras'.
     """
     # Evenly chosen cameras in their order, rotated so that the one to start from comes first.
     others = _evenly(len(cameras), _MAX_PAGE_CAMERAS)
@@ -276,7 +283,8 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float], beyond: f
     depths = []
     for view in chosen:
         depths.append(depth(view))
-    up = torch.nn.functional.normalize(upwards(cameras).double(), dim=0)
+    above = upwards(cameras) if up is None else torch.tensor(up)
+    above = torch.nn.functional.normalize(above.double(), dim=0)
     # One may go beyond the outermost camera, and half as far again as what is looked at: then nothing is left
     # to see.
     place = cameras.pose[:, :, 3].double()
@@ -286,7 +294,7 @@ def about(cameras: Cameras, start: int, depth: Callable[[int], float], beyond: f
         + _REACH_DEPTHS * sorted(depths)[len(depths) // 2]
     )
     return {
-        "up": up.tolist(),
+        "up": above.tolist(),
         "reach": {"centre": centre.tolist(), "radius": radius},
         "cameras": [_camera(cameras, view, far) for view, far in zip(chosen, depths, strict=True)],
         "seen": [_frame(cameras, view, beyond) for view in _evenly(len(cameras), _MAX_SEEN_CAMERAS)],

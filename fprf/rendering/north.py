@@ -78,24 +78,35 @@ class NorthFit(NamedTuple):
     """Of these in metres."""
 
 
-def world_axes(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
-    """Up, as cameras are held level, and the level direction of the first view; both of length 1."""
-    right = cameras.pose[:, :, 0].double()
-    # Held level, all have their x axes square to it; of views in one direction their own y axes tell it.
-    above = (cameras.pose[:, :, 1] + 0.5 * cameras.pose[:, :, 2]).double().mean(0)
-    moments = right.T @ right / len(right) - 1e-4 * torch.outer(above, above)
-    up = torch.linalg.eigh(moments)[1][:, 0]
-    up = up * (1.0 if float(up @ above) >= 0 else -1.0)
+def world_axes(
+    cameras: Cameras, known: tuple[float, float, float] | None = None
+) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+    """Up, where it is not known as cameras are held level, and the level direction of the first view; both of length 1."""
+    up = _held_level(cameras) if known is None else torch.tensor(known).double()
     ahead = (cameras.pose[0, :, 1] - cameras.pose[0, :, 2]).double()
     ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
     return up.float(), ahead.float()
 
 
-def bearings_of(cameras: Cameras, north: North | None) -> Bearings | None:
-    """Bearings of a scene that cameras see; None where nothing tells its north."""
+def _held_level(cameras: Cameras) -> Annotated[Tensor, "3"]:
+    """Up as cameras are held level; of length 1."""
+    right = cameras.pose[:, :, 0].double()
+    # All have their x axes square to it; of views in one direction their own y axes tell it.
+    above = (cameras.pose[:, :, 1] + 0.5 * cameras.pose[:, :, 2]).double().mean(0)
+    moments = right.T @ right / len(right) - 1e-4 * torch.outer(above, above)
+    up = torch.linalg.eigh(moments)[1][:, 0]
+    return up if float(up @ above) >= 0 else -up
+
+
+def bearings_of(
+    cameras: Cameras, north: North | None, up: tuple[float, float, float] | None
+) -> Bearings | None:
+    """Bearings of a scene that cameras see, with its direction up where that is known; None where nothing tells its
+    north.
+    """
     if north is None:
         return None
-    x, y, z = world_axes(cameras)[0].tolist()
+    x, y, z = world_axes(cameras, up)[0].tolist()
     return Bearings(north.direction, (x, y, z))
 
 

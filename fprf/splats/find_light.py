@@ -42,25 +42,30 @@ _MIN_LIKENESS = 0.6
 
 @torch.inference_mode()
 def find_illumination(
-    gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    antialiased: bool,
+    near: float,
+    up: tuple[float, float, float] | None = None,
 ) -> Illumination:
-    """Find surfaces, the sky and openness from views."""
-    up, ahead = world_axes(cameras)
+    """Find surfaces, the sky and openness from views; `up` = None takes these for held level."""
+    upwards, ahead = world_axes(cameras, up)
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
     count = min(_VIEWS, len(cameras))
     chosen = cameras.select(torch.linspace(0, len(cameras) - 1, count).round().long())
     chosen = chosen.scaled(max(1.0, float(chosen.size.amax()) / _VIEW_PIXELS))
     pinholes = [covering(chosen, view, near) for view in range(count)]
-    surfaces = find_surfaces(*shape, pinholes, up=up, antialiased=antialiased)
+    surfaces = find_surfaces(*shape, pinholes, up=upwards, antialiased=antialiased)
     bulk = bulk_of(gaussians.means.numpy())
     far = torch.from_numpy(bulk.apart > _MAX_BLOCKER_DISTANCE)
     eyes = cameras.pose[:, :, 3].float().mean(0)
-    heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ up
+    heights = torch.nn.functional.normalize(gaussians.means - eyes, dim=1) @ upwards
     above = heights > MIN_SKY_HEIGHT
     far = far | (above & _behind_ground(gaussians.means, ~above))
     sky = far & above
     # Half of the views tell as much: on the town all of them are 0.02 dB worse, and take 0.6 s more for a plant.
-    like, followed, spread = _seen_again(gaussians, surfaces, far, sky, pinholes[::2], up, antialiased)
+    like, followed, spread = _seen_again(gaussians, surfaces, far, sky, pinholes[::2], upwards, antialiased)
     far = far | sky | ((like > _MIN_LIKENESS) & above)
     sky = sky | ((torch.maximum(like, followed) > _MIN_LIKENESS) & above)
     blockers = blockers_of(gaussians, far)
@@ -72,11 +77,13 @@ def find_illumination(
         far,
         sky,
         heights,
-        up,
+        upwards,
         ahead,
         gaussians.colours,
     )
-    open_ = openness(blockers, found.points, surfaces.normals, up, found.offset, found.offset, found.blur)
+    open_ = openness(
+        blockers, found.points, surfaces.normals, upwards, found.offset, found.offset, found.blur
+    )
     return replace(found, openness=torch.where(sky, torch.ones(()), open_))
 
 

@@ -30,14 +30,22 @@ _PARTS = ("spread", "openness", "far", "sky", "heights", "up", "ahead")
 
 
 def kept_illumination(
-    folder: Path, gaussians: Gaussians, cameras: Cameras, *, antialiased: bool, near: float
+    folder: Path,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    antialiased: bool,
+    near: float,
+    up: tuple[float, float, float] | None = None,
 ) -> Illumination:
-    """Surfaces, openness, the sky and the captured sun from a folder of the cache, else found and kept there."""
-    path = folder / f"{_key(gaussians, cameras, antialiased, near)}.safetensors"
+    """Surfaces, openness, the sky and the captured sun from a folder of the cache, else found and kept there;
+    arguments as those of `find_illumination`.
+    """
+    path = folder / f"{_key(gaussians, cameras, antialiased, near, up)}.safetensors"
     known = _read(path, gaussians)
     if known is not None:
         return known
-    found = find_illumination(gaussians, cameras, antialiased=antialiased, near=near)
+    found = find_illumination(gaussians, cameras, antialiased=antialiased, near=near, up=up)
     found = replace(found, known_sun=(found.captured_sun,))
     tensors = {name: getattr(found, name) for name in _PARTS} | found.surfaces._asdict()
     if found.captured_sun is not None:
@@ -48,9 +56,16 @@ def kept_illumination(
     return found
 
 
-def _key(gaussians: Gaussians, cameras: Cameras, antialiased: bool, near: float) -> str:
+def _key(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    antialiased: bool,
+    near: float,
+    up: tuple[float, float, float] | None,
+) -> str:
     """A name that follows from all that is looked at."""
-    digest = hashlib.sha256(f"{_LIGHT_CACHE_VERSION} {antialiased} {near!r}".encode())
+    known = "" if up is None else f" {up}"
+    digest = hashlib.sha256(f"{_LIGHT_CACHE_VERSION} {antialiased} {near!r}{known}".encode())
     shape = [
         gaussians.means,
         gaussians.quaternions,

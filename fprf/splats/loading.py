@@ -156,6 +156,7 @@ def open_gaussians(run: Run, config: RunConfig, device: str, quality: QualityCon
         near=near,
         background=config.background,
         origin=known.facts.origin,
+        up=known.facts.up,
         north=known.facts.north,
         resolution=resolution if quality.resolution is None else quality.resolution,
         tone=(1.0, 1.0, 1.0) if quality.tone is None else tone_of(tones, known, quality.tone),

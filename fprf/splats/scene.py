@@ -98,6 +98,8 @@ class SplatScene(Scene):
     """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the Gaussians and the views."""
+    up: tuple[float, float, float] | None = None
+    """Direction up; None = as the views are held level."""
     north: North | None = None
     """Direction of north; None if nothing tells it."""
     tones: Tones | None = None
@@ -206,7 +208,7 @@ class SplatScene(Scene):
 
     def gaussian_rows(self) -> GaussianRows:
         """All Gaussians in the scene's look, to be read in parts."""
-        bearings = bearings_of(self.views, self.north)
+        bearings = bearings_of(self.views, self.north, self.up)
         return GaussianRows(len(self.gaussians), self.part, self.antialiased, bearings)
 
     @cached_property
@@ -386,7 +388,9 @@ class SplatScene(Scene):
 
 def illuminated(scene: SplatScene) -> Illumination:
     """Find surfaces, shadows and sky of a scene for another light, from its views."""
-    found = find_illumination(scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near)
+    found = find_illumination(
+        scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near, up=scene.up
+    )
     return facing_north(found, scene.north)
 
 
@@ -398,7 +402,12 @@ def with_illumination(scene: SplatScene, folder: Path | None = None) -> SplatSce
     def known() -> Illumination:
         kept_in = folder or cache_folder("light")
         kept = kept_illumination(
-            kept_in, scene.gaussians, scene.views, antialiased=scene.antialiased, near=scene.near
+            kept_in,
+            scene.gaussians,
+            scene.views,
+            antialiased=scene.antialiased,
+            near=scene.near,
+            up=scene.up,
         )
         return facing_north(kept, scene.north)
 

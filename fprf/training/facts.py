@@ -58,6 +58,8 @@ class Facts:
     """World distance that views commonly see: the unit in which cameras are shifted."""
     origin: Origin = (0.0, 0.0, 0.0)
     """Origin of the local frame that all of the run is in (see `rendering.local_frame`)."""
+    up: tuple[float, float, float] | None = None
+    """Direction up, where the capture tells it; None = as its cameras are held level."""
     north: North | None = None
     """Direction of north, if the capture tells it."""
     field: FieldFacts | None = None

@@ -65,6 +65,10 @@ class Trained(Scene):
         return self.known.facts.origin
 
     @property
+    def up(self) -> tuple[float, float, float] | None:
+        return self.known.facts.up
+
+    @property
     def north(self) -> North | None:
         return self.known.facts.north
 

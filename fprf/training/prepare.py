@@ -63,7 +63,7 @@ def read_whole_scene(config: RunConfig) -> ParsedScene:
     """The scene of a config at its own size. Raises as `read_scene`."""
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data garden for the embedded one")
-    return parse_scene(config.data, 1, config.reading.parser)
+    return parse_scene(config.data, 1, config.reading.parser, config.up)
 
 
 def scene_at_size(config: RunConfig, whole: ParsedScene, saved: Facts | None = None) -> ParsedScene:
@@ -103,6 +103,7 @@ def facts_of(
         else (),
         reach=reach_of(scene, space) if poses else 1.0,
         origin=scene.origin,
+        up=scene.up,
         north=scene.north,
     )
 

@@ -151,11 +151,14 @@ def test_north_is_where_the_user_says(tmp_path: Path) -> None:
         with_asked_north(capture, replace(look, north=(0.0, 0.0, 0.0)))
 
 
-def test_facts_of_a_run_keep_north(scene: ParsedScene) -> None:
-    facts = facts_of(replace(scene, north=North(direction=NORTH, source="a compass", southern=True)))
+def test_facts_of_a_run_keep_north_and_up(scene: ParsedScene) -> None:
+    north = North(direction=NORTH, source="a compass", southern=True)
+    facts = facts_of(replace(scene, north=north, up=UP))
+    assert facts.up == UP
     assert facts.north is not None and facts.north.direction == NORTH
     document = json.loads(json.dumps(facts_to_json(facts)))
     assert facts_from_json(document) == facts
     # Files of before say nothing.
     del document["north"]
-    assert facts_from_json(document) == replace(facts, north=None) == facts_of(scene)
+    del document["up"]
+    assert facts_from_json(document) == replace(facts, north=None, up=None) == facts_of(scene)

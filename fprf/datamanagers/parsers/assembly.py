@@ -51,6 +51,8 @@ class CaptureContents:
     """Pairs [O 2] of a view and a point that it shows."""
     reduced: bool = False
     """Images are copies, of one shape with the cameras, that may each be reduced by a factor of its own."""
+    up: tuple[float, float, float] | None = None
+    """Direction up, if the capture says it."""
     north: North | None = None
     """Direction of north, if the capture says it."""
     notes: Sequence[str] = ()
@@ -106,6 +108,7 @@ def assemble_scene(data: Path, contents: CaptureContents, *, downscale: float) -
         masks=used.masks,
         sky_masks=sky.masks,
         alpha=_is_transparent(views, headers),
+        up=contents.up,
         north=contents.north,
         notes=(*contents.notes, *scaling, *used.notes, *sky.notes),
     )

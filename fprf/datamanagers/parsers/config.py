@@ -381,15 +381,22 @@ def recognise(data: Path) -> DataParserConfig:
     )
 
 
-def parse_scene(data: Path, downscale: float, parser: DataParserConfig | None) -> ParsedScene:
+def parse_scene(
+    data: Path,
+    downscale: float,
+    parser: DataParserConfig | None,
+    up: tuple[float, float, float] | None = None,
+) -> ParsedScene:
     """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one,
-    recognised.
+    recognised. `up` is the direction that points up, where it is asked for.
 
     Where the capture lies far from 0 the scene is in a local frame, whatever the parser
     (`ParsedScene.origin`).
     """
     from ..positions import with_north
     from ..scene import in_local_frame
+    from ..up_direction import with_up
 
     chosen = recognise(data) if parser is None else parser
-    return with_north(in_local_frame(chosen.build().parse(data, downscale)))
+    scene = in_local_frame(chosen.build().parse(data, downscale))
+    return with_north(with_up(scene, up))

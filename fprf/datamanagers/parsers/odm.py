@@ -71,7 +71,9 @@ class OdmParser(DataParser):
             ((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0]
         )
         views, _, lost = read_views(data, named, lambda each: _view(str(file), *each))
-        contents = CaptureContents(views=views, points=points, north=north, notes=(*said, *lost))
+        # A world that is placed on the earth has z up.
+        up = None if north is None else (0.0, 0.0, 1.0)
+        contents = CaptureContents(views=views, points=points, up=up, north=north, notes=(*said, *lost))
         return assemble_scene(data, contents, downscale=downscale)
 
 
