@@ -94,7 +94,7 @@ def _held_level(cameras: Cameras) -> Annotated[Tensor, "3"]:
     # All have their x axes square to it; of views in one direction their own y axes tell it.
     above = (cameras.pose[:, :, 1] + 0.5 * cameras.pose[:, :, 2]).double().mean(0)
     moments = right.T @ right / len(right) - 1e-4 * torch.outer(above, above)
-    up = torch.linalg.eigh(moments)[1][:, 0]
+    up: Tensor = torch.linalg.eigh(moments)[1][:, 0]
     return up if float(up @ above) >= 0 else -up
 
 
