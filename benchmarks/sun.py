@@ -25,7 +25,8 @@ from torch import Tensor
 from fprf.checks import at_least
 from fprf.cli.parsing import load_method, parse
 from fprf.errors import UsageError
-from fprf.light.relight import Received, encoded, gains, linear
+from fprf.io.images import srgb_to_linear
+from fprf.light.relight import Received, encoded, gains
 from fprf.light.sky import Light
 from fprf.ops.rasterise.rendering import Pinhole
 from fprf.splats.drawing import draw
@@ -236,7 +237,7 @@ def with_best_gain(pictures: Tensor, truth: Tensor, where: Tensor) -> Tensor:
     some = where.flatten().nonzero()[::9, 0]
     out = []
     for channel in range(3):
-        light = linear(pictures[..., channel])
+        light = srgb_to_linear(pictures[..., channel])
         asked = light.flatten()[some]
         wanted = truth[..., channel].flatten()[some]
         best = 0.0

@@ -18,7 +18,8 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from .relight import GROUND_ALBEDO, SHOULDER, Received, level_share, linear, sky_share
+from ..io.images import srgb_to_linear
+from .relight import GROUND_ALBEDO, SHOULDER, Received, level_share, sky_share
 from .sky import LUMA
 
 _SOUGHT_STRENGTH = 10.0
@@ -112,7 +113,7 @@ def _followed(
 
 def scene_light(colours: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
     """Linear light before a camera's shoulder, from sRGB."""
-    light = linear(colours.clamp(0, 1))
+    light = srgb_to_linear(colours.clamp(0, 1))
     return light / (1 - SHOULDER * light)
 
 

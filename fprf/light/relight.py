@@ -23,6 +23,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
+from ..io.images import srgb_to_linear
 from .sky import LUMA, Light
 
 LINEAR_OFFSET = 0.055
@@ -123,7 +124,7 @@ def exposed_gain(
     share: float,
 ) -> Annotated[Tensor, "N 3"]:
     """k of each Gaussian for E / E0 above; the mean luma becomes `share` of what it was."""
-    before = linear(colours.clamp(0, 1))
+    before = srgb_to_linear(colours.clamp(0, 1))
     exposure = _exposure(before, ratio, weights, share)
     after = encoded(_compressed(before, exposure * ratio))
     gain = (after + LINEAR_OFFSET) / (encoded(before) + LINEAR_OFFSET)
@@ -140,14 +141,8 @@ def exposure_of(
 ) -> float:
     """e of `gains`, above."""
     return _exposure(
-        linear(colours.clamp(0, 1)), light_ratio(received, light, sun, up), weights, light.brightness
+        srgb_to_linear(colours.clamp(0, 1)), light_ratio(received, light, sun, up), weights, light.brightness
     )
-
-
-def linear(colour: Tensor) -> Tensor:
-    """Linear light of sRGB (IEC 61966-2-1)."""
-    curve = ((colour + LINEAR_OFFSET) / (1 + LINEAR_OFFSET)).clamp_min(0).pow(2.4)
-    return torch.where(colour <= 0.04045, colour / 12.92, curve)
 
 
 def encoded(light: Tensor) -> Tensor:

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..io.images import srgb_to_linear
 from ..ops.rasterise.rendering import Pinhole
-from .relight import linear
 from .sky import LUMA
 
 _SURE_SHARE = 0.7
@@ -59,7 +59,7 @@ def sky_pixels(
 
     `image` is sRGB in [0, 1]; `sure` the share of each pixel that Gaussians show which lie where only the sky is.
     """
-    colour = linear(image).cpu().numpy()
+    colour = srgb_to_linear(image).cpu().numpy()
     known = (sure > _SURE_SHARE).cpu().numpy()
     above = (heights(camera, up) > MIN_SKY_HEIGHT).cpu().numpy()
     like = _likeness(colour, known)

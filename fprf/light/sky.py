@@ -14,6 +14,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
+from ..io.images import srgb_to_linear
 from .config import Colour, SunConfig, parse_light_colour
 
 _WAVELENGTHS = (0.61, 0.55, 0.465)
@@ -191,6 +192,4 @@ def _chosen(field: str, text: str) -> Annotated[Tensor, "3"]:
     given: Colour | float = parse_light_colour(field, text)
     if isinstance(given, float):
         return kelvin_colour(given)
-    encoded = torch.tensor(given)
-    linear = torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return _white(linear.clamp_min(1e-3))
+    return _white(srgb_to_linear(torch.tensor(given)).clamp_min(1e-3))
