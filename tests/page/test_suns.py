@@ -13,9 +13,10 @@ from pages import page_of, seen, street
 from splat_ball import ball
 
 from fprf.errors import ConfigError
+from fprf.io.images import srgb_to_linear
 from fprf.light.config import SunConfig
 from fprf.light.day import check_suns, day
-from fprf.light.relight import LINEAR_OFFSET, encoded, level_share, linear, sky_share, sun_share
+from fprf.light.relight import LINEAR_OFFSET, encoded, level_share, sky_share, sun_share
 from fprf.page.suns import packed_day, packed_light, packed_surfaces, surfaces_header
 from fprf.page.writer import page_html
 from fprf.splats.scene import SplatScene
@@ -75,7 +76,7 @@ def gain_of(scene: SplatScene, terms: dict[str, list[float]], level: NDArray[np.
     u, o, m = (torch.from_numpy(each)[:, None] for each in (level, opened, met))
     sun, sky, bounce = (torch.tensor(terms[name]) for name in ("sun", "sky", "bounce"))
     ratio = (m * sun / o + u * sky + (1 - u) * bounce) / (u + (1 - u) * head["albedo"])
-    y = linear(scene.gaussians.colours.clamp(0, 1))
+    y = srgb_to_linear(scene.gaussians.colours.clamp(0, 1))
     lit = ratio * y / (1 - head["shoulder"] * y)
     return ((encoded(lit / (1 + head["shoulder"] * lit)) + 0.055) / (encoded(y) + 0.055)).clamp_max(
         head["most"]
