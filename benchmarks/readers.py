@@ -20,7 +20,7 @@ import torch
 from fprf.config_files import load_config
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked, read_examples
-from fprf.datamanagers.parsers.colmap import read_model
+from fprf.datamanagers.parsers.colmap_model import read_model
 from fprf.datamanagers.parsers.config import (
     ColmapConfig,
     LlffConfig,

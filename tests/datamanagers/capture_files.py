@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fprf.datamanagers.parsers.colmap import MODELS
+from fprf.datamanagers.parsers.colmap_model import MODELS
 from fprf.rendering.cameras import Cameras
 
 

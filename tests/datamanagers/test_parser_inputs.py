@@ -32,7 +32,7 @@ from capture_files import (
 )
 
 from fprf.datamanagers.images import load_images
-from fprf.datamanagers.parsers.colmap import MODELS
+from fprf.datamanagers.parsers.colmap_model import MODELS
 from fprf.datamanagers.parsers.config import TransformsConfig, parse_scene
 from fprf.datamanagers.scene import ParsedScene
 from fprf.errors import DataError
