@@ -3,15 +3,19 @@
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 
+from fprf.page.looks import Look, Photograph
 from fprf.page.messages import Camera
-from fprf.page.state import Look, PageKeyframe
+from fprf.page.state import PageKeyframe
 from fprf.scenes import Scene
 from fprf.splats.pinholes import camera_of as pinhole_of
+from fprf.style.dictionary import Reference
 
 
 def camera_of(scene: Scene, view: int) -> Camera:
@@ -69,3 +73,11 @@ class Listener:
 
     def until_said(self, part: str) -> None:
         self.until(lambda: any(part in text for text in self.said))
+
+
+def card(number: int) -> Photograph:
+    """A photograph on the shelf, of no content."""
+    empty = Reference(f"{number}", torch.zeros(0, 2), torch.zeros(0, 2))
+    return Photograph(
+        number, f"{number}.png", Path(f"/tmp/{number}.png"), np.zeros((1, 1, 3), np.uint8), empty
+    )

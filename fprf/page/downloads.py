@@ -10,7 +10,7 @@ from ..splats.gaussians import GaussianRows, Gaussians
 from ..splats.scene import SplatScene
 from ..style.config import StyleConfig, find_reference, parse_region_value
 from ..style.files import StyleFile, write_style
-from .state import Look
+from .looks import Look
 
 SAVED_FORMATS = (".ply", ".spz", ".sog", ".glb")
 """Endings of files of Gaussians that the page saves."""

@@ -32,10 +32,11 @@ from ..style.matching import unit
 from ..style.regions import Regions, find_regions, memberships
 from ..style.restyle import Styled, apply_dictionary, apply_style
 from ..style.scene_style import RegionWeight, SceneStyle
+from .looks import Look, Photograph, RegionAction, RegionRule, Shown
 from .messages import Camera, ViewRequest
 from .pack import Colours, Packed
 from .render_worker import Steps
-from .state import Look, Photograph, RegionAction, RegionInfo, RegionRule, Shown
+from .state import RegionInfo
 
 K = TypeVar("K")
 V = TypeVar("V")

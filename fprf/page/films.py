@@ -25,9 +25,10 @@ from ..style.files import StyleFile, read_keyframes
 from ..style.restyle import keyed_looks
 from .downloads import write_style_of
 from .drawing import cameras_of, strips_of
+from .looks import Look
 from .messages import Film
 from .render_worker import RenderWorker, Steps
-from .state import FilmProgress, Look, PageKeyframe
+from .state import FilmProgress, PageKeyframe
 
 _MAX_FILM_SECONDS = 600.0
 """Length of a film that is made from the page, at most: `fprf render` makes longer ones."""

@@ -21,8 +21,9 @@ from ..io.atomic import write_bytes
 from ..plugins.codec import from_json, to_json
 from ..style.config import StyleConfig
 from ..style.scene_style import SceneStyle
+from .looks import Look, Photograph, RegionAction, RegionRule
 from .messages import Camera
-from .state import Look, Made, PageKeyframe, Photograph, RegionAction, RegionRule
+from .state import Made, PageKeyframe
 
 _DOCUMENT = "page.json"
 _HASH_CHARACTERS = 32

@@ -44,6 +44,7 @@ from .drawing import (
 )
 from .films import start_film, write_film_files
 from .lighting import Lights
+from .looks import Look, Photograph, Shown, sliders
 from .pack import colour_header, colour_section, container
 from .render_worker import RenderWorker, Steps
 from .saved import (
@@ -59,7 +60,7 @@ from .saved import (
     regions_now,
     write_page,
 )
-from .state import NOW, FilmProgress, History, Look, Made, Photograph, SharedState, Shown, sliders
+from .state import NOW, FilmProgress, History, Made, SharedState
 from .uploads import Uploads, shown_name, unpack_style
 from .writer import about, packed_scene
 

@@ -11,8 +11,8 @@ from splat_ball import ball
 from tiny_world import World
 
 from fprf.page.drawing import Restyler
+from fprf.page.looks import Photograph
 from fprf.page.session import Session, Viewed, view_of_run
-from fprf.page.state import Photograph
 from fprf.training.loading import open_run
 
 

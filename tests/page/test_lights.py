@@ -176,7 +176,7 @@ def test_all_rows_thinned_by_one_receive_the_same() -> None:
 
 
 def test_a_look_in_the_captured_light_keeps_all_else() -> None:
-    from fprf.page.state import Look
+    from fprf.page.looks import Look
 
     style = StyleConfig(light="noon", sun=(3.0, 4.0), sun_colour="3000K", bold=0.3)
     assert Look(style=style).unlit == Look(style=StyleConfig(bold=0.3))

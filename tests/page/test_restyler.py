@@ -24,8 +24,8 @@ from fprf.page.drawing import (
     matching_regions,
 )
 from fprf.page.films import film_cameras, film_frames, write_film_files
+from fprf.page.looks import Look, Photograph, Shown
 from fprf.page.session import Session
-from fprf.page.state import Look, Photograph, Shown
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle

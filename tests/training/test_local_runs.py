@@ -21,8 +21,9 @@ from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
 from fprf.page.films import write_film_files
+from fprf.page.looks import Look
 from fprf.page.messages import Camera, Film
-from fprf.page.state import Look, PageKeyframe
+from fprf.page.state import PageKeyframe
 from fprf.rendering.local_frame import read_offset
 from fprf.rendering.paths import read_camera_path
 from fprf.splats.files import read_capture
