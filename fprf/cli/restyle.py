@@ -5,23 +5,28 @@ Gaussians.
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..checks import positive
 from ..errors import DataError, UsageError
-from ..io.overwriting import Origin, OverwriteConfig, same_file, unused_name
-from ..light.day import check_suns
-from ..plugins.captures import captures_in, endings, format_name, is_scene, stem_of
-from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+from ..io.overwriting import Origin
+from ..plugins.captures import endings, format_name, is_scene, stem_of
 from ..progress import Display
-from ..splats.config import LookConfig
 from ..style.config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value
 from ..style.files import StyleFile, write_style
-from .parsing import read_paths
-from .style_flags import origin_of, read_flags, say
+from .restyle_outputs import (
+    CaptureFile,
+    RestyleConfig,
+    files_of,
+    names_of,
+    output_of,
+    styles_of,
+    with_outputs,
+    written_files,
+)
+from .style_flags import origin_of, read_flags
 from .stylize import print_explained
 
 if TYPE_CHECKING:
@@ -44,62 +49,6 @@ photographs. In the format that was read everything but colours is kept bit for 
 lists them), its name in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png; in --pin also a place:
 box:X,Y,Z:X,Y,Z:BORDER, path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, from 0 in the order
 given."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RestyleConfig(StyleConfig, LookConfig, OverwriteConfig):
-    """Flags of `fprf restyle`: the capture, the style and the files to write."""
-
-    captures: tuple[Path, ...] = ()
-    """The captures: files of Gaussians, SOG folders, or folders of them. Several take one style together, so that
-    neighbours stay alike.
-    """
-    output: Path | None = None
-    """The restyled capture; its ending says the format. A folder for several captures, or where it is one
-    already.
-    """
-    style: Path | None = None
-    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over
-    it.
-    """
-    stylizer: StylizerConfig = RegionToneConfig(centred=False)
-    """Method that changes the colours of the capture."""
-    match_light: bool = False
-    """Take exposure and white balance of the references alone: one gain for each channel of the whole
-    scene.
-    """
-    each: bool = False
-    """Each reference is a style of its own; its name is added to those of the files."""
-    page: Path | None = None
-    """A web page (.html) to walk through the capture before and after; it loads nothing and can be sent."""
-    megabytes: float = 16.0
-    """Size of that page, at most; Gaussians that show least are left out of it."""
-    suns: int = 12
-    """Suns of a day on that page, from 2 to 64; one chooses the time there. 0 = none. Each adds
-    about a hundredth to its size.
-    """
-    explain: bool = False
-    """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside
-    the output.
-    """
-    cache: Path | None = None
-    """Folder for what is found out about captures, so that the next style takes a second; by default the
-    user's cache.
-    """
-
-    def __post_init__(self) -> None:
-        StyleConfig.__post_init__(self)
-        LookConfig.__post_init__(self)
-        positive("megabytes", self.megabytes)
-        check_suns(self.suns)
-
-
-class _CaptureFile(NamedTuple):
-    """Files that are written for one capture in one style."""
-
-    capture: Path
-    style: Path
-    """The style file beside it."""
 
 
 class _Restyled(NamedTuple):
@@ -127,23 +76,23 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         RestyleConfig(), args, prog="fprf restyle", description=_RESTYLE_HELP, positional=("captures",)
     )
-    config, outputs = _outputs(config)
+    config, outputs = with_outputs(config)
     origin = origin_of("restyle", config, file)
     _check_references(file.style)
-    styles = _styles(config, file)
-    files = _files(config, outputs, styles, origin)
-    for made_of, paths in _written(config, files, styles, origin):
+    styles = styles_of(config, file)
+    files = files_of(config, outputs, styles, origin)
+    for made_of, paths in written_files(config, files, styles, origin):
         made_of.check(paths)
     photographed = file.style.references
     file = _with_views(config, file, origin)
     config = replace(config, references=file.style.references, weights=(), masks=())
     with contextlib.ExitStack() as stack:
-        for made_of, paths in _written(config, files, styles, origin):
+        for made_of, paths in written_files(config, files, styles, origin):
             stack.enter_context(made_of.writing(paths))
         display = stack.enter_context(Display())
         seen, looked = _look(config, display)
         gain = _neighbours_gain(config, photographed, seen, display)
-        made = _apply(_styles(config, file), seen.scene, gain, config)
+        made = _apply(styles_of(config, file), seen.scene, gain, config)
         written = _write_captures(config, files, made, seen, display)
         _say_notes(config, made)
         if config.explain:
@@ -218,7 +167,7 @@ def _apply(
 
 def _write_captures(
     config: RestyleConfig,
-    files: Sequence[Sequence[_CaptureFile]],
+    files: Sequence[Sequence[CaptureFile]],
     made: Sequence[_Restyled],
     seen: "Captures",
     display: Display,
@@ -275,7 +224,7 @@ def _explain(config: RestyleConfig, file: StyleFile, scene: "SplatScene", made: 
     """List the regions of the scene with what they take in each style; alone where there is none."""
     from ..style.regions import Regions
 
-    folder = _beside(config).parent
+    folder = output_of(config).parent
     for one in made:
         print_explained(folder / one.name, one.styled.controls.regions, one.styled)
     if not made:
@@ -304,190 +253,6 @@ def _report(
     )
 
 
-def _beside(config: RestyleConfig) -> Path:
-    """The output that everything else lies beside."""
-    return config.output or config.page or Path("x")
-
-
-def _outputs(config: RestyleConfig) -> tuple[RestyleConfig, list[Path]]:
-    """The config with the captures of folders in the place of these, and the file for each capture; none where
-    none is to be written.
-
-    Raises UsageError for what cannot be written, before anything takes time.
-    """
-    if not config.captures:
-        raise UsageError(
-            "fprf restyle: name a capture, for example fprf restyle scan.ply --references autumn.jpg --output new.ply"
-        )
-    # Something must be asked for, and have what it needs, before a capture is read.
-    if config.output is None and not (config.page or config.explain):
-        raise UsageError("fprf restyle: name what to write, with --output, --page or --explain")
-    if config.page is not None and config.page.suffix.lower() != ".html":
-        raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
-    if not config.references and not config.light_asked and not config.explain:
-        raise UsageError(
-            "--references: at least one photograph is needed, for example --references autumn.jpg night.jpg, or a "
-            "light, for example --light golden-hour"
-        )
-    captures = _with_folders(config.captures)
-    several = len(captures) > 1 or captures != config.captures
-    config = replace(config, captures=captures)
-    if config.output is None:
-        return config, []
-    # A folder holds a file for each capture.
-    if config.output.is_dir() or (several and format_name(config.output) is None):
-        return config, _outputs_in_folder(config, config.output)
-    if len(captures) > 1:
-        raise UsageError(f"--output {config.output}: {len(captures)} captures need a folder; name one")
-    _check_format(config.output)
-    return config, [config.output]
-
-
-def _with_folders(captures: Sequence[Path]) -> tuple[Path, ...]:
-    """The captures, with those in a folder of captures in its place. Raises UsageError for a folder without."""
-    found: list[Path] = []
-    for path in captures:
-        if not path.is_dir() or is_scene(path):
-            found.append(path)
-            continue
-        held = captures_in(path)
-        if not held:
-            raise UsageError(
-                f"{path}: a folder without captures; name a file ({' '.join(endings())}), a SOG folder, or a folder of them"
-            )
-        found += held
-    return tuple(found)
-
-
-def _outputs_in_folder(config: RestyleConfig, folder: Path) -> list[Path]:
-    """The files in a folder for each capture: under its own name, or a .ply where its format is read alone."""
-    from ..splats.files.base import format_of
-
-    outputs: list[Path] = []
-    for path in config.captures:
-        index = path.name.lower() in ("meta.json", "lod-meta.json")
-        inside = folder / (path.parent.name if index else path.name)
-        known = format_name(path)
-        if index or path.is_dir():
-            outputs.append(inside / "meta.json")
-        elif known is not None and not format_of(path).writes:
-            outputs.append(inside.with_suffix(".ply"))
-        else:
-            outputs.append(inside)
-    names = Counter(str(path).casefold() for path in outputs)
-    for path in outputs:
-        if names[str(path).casefold()] > 1:
-            raise UsageError(
-                f"--output {folder}: several captures would be written as {path}; give them other names"
-            )
-    return outputs
-
-
-def _check_format(output: Path) -> None:
-    """Raise UsageError for a file of Gaussians that cannot be written, DataError where a package is missing."""
-    from ..splats.files.base import check_needs, format_of
-
-    if format_name(output) is None:
-        known_endings = ", ".join(endings())
-        raise UsageError(
-            f"--output {output}: no file of Gaussians by its name; known endings are {known_endings}"
-        )
-    form = format_of(output)
-    if not form.writes:
-        raise UsageError(
-            f"--output {output}: files of this format are read, not written; name a .ply, .spz, .sog or .glb"
-        )
-    check_needs(form)
-
-
-def _files(
-    config: RestyleConfig, outputs: Sequence[Path], styles: Sequence[tuple[str, StyleFile]], origin: Origin
-) -> list[list[_CaptureFile]]:
-    """The files of each capture in each style."""
-    files = []
-    for output in outputs:
-        row = []
-        for name, style in styles:
-            row.append(_file_in_style(config, output, name, _origin_of_style(config, style, origin)))
-        files.append(row)
-    return files
-
-
-def _file_in_style(config: RestyleConfig, output: Path, name: str, origin: Origin) -> _CaptureFile:
-    """The file of a capture in one style, with its style file beside it.
-
-    The style's name goes before the ending; a SOG folder gets a folder of that name, and holds its style.json.
-    The style file that is read is never the one that is written, unless the user asked for that.
-    """
-    stem = stem_of(output)
-    folder = output.name.lower() == "meta.json"
-    if name and folder:
-        output = output.parent / name / output.name
-    elif name:
-        output = output.with_name(f"{stem}-{name}{output.name[len(stem) :]}")
-    usual = "style" if folder else f"{stem_of(output)}.style"
-    saved = output.with_name(f"{usual}.json")
-    if config.style is None or config.overwrite or not same_file(saved, config.style):
-        return _CaptureFile(output, saved)
-    base = "" if folder else stem_of(output)
-    taken = [base]
-    while origin.refusal(saved) is not None:
-        taken.append(unused_name(base, taken))
-        saved = output.with_name(f"{taken[-1].lstrip('-')}.style.json")
-    say(f"{config.style} is read and stays as it is; the new style is {saved}")
-    return _CaptureFile(output, saved)
-
-
-def _origin_of_style(config: RestyleConfig, style: StyleFile, origin: Origin) -> Origin:
-    """Origin of the files in one style: of a style of its own (`--each`) only its photograph counts."""
-    if not config.each:
-        return origin
-    made_of = (*config.captures, *read_paths(style.style))
-    if config.style is not None:
-        made_of = (*made_of, config.style)
-    return replace(origin, reads=made_of, beside=origin.reads)
-
-
-def _written(
-    config: RestyleConfig,
-    files: Sequence[Sequence[_CaptureFile]],
-    styles: Sequence[tuple[str, StyleFile]],
-    origin: Origin,
-) -> list[tuple[Origin, list[Path]]]:
-    """Every file that is written, with its origin; views in the place of captures among the references are not
-    among them.
-    """
-    found: list[tuple[Origin, list[Path]]] = []
-    for number, (name, style) in enumerate(styles):
-        paths = _explained(config, name)
-        for row in files:
-            paths += _capture_files(row[number])
-        found.append((_origin_of_style(config, style, origin), paths))
-    if not styles:
-        found.append((origin, _explained(config, "")))
-    if config.page is not None:
-        found.append((origin, [config.page]))
-    return found
-
-
-def _explained(config: RestyleConfig, name: str) -> list[Path]:
-    """The files of `--explain` in a style."""
-    folder = _beside(config).parent / name
-    if config.explain:
-        return [folder / "explain.json", folder / "explain.png"]
-    return []
-
-
-def _capture_files(file: _CaptureFile) -> list[Path]:
-    """The files of a capture: with its style, its offset, and what lies in a SOG folder already."""
-    from ..rendering.local_frame import offset_file
-
-    paths = [file.capture, offset_file(file.capture), file.style]
-    if file.capture.name.lower() == "meta.json":  # its pictures have names of their own
-        paths += [*file.capture.parent.glob("*.webp"), *file.capture.parent.glob("*.png")]
-    return paths
-
-
 def _with_views(config: RestyleConfig, file: StyleFile, origin: Origin) -> StyleFile:
     """The style with rendered views in the place of captures and runs among its references."""
     style = file.style
@@ -502,7 +267,7 @@ def _with_views(config: RestyleConfig, file: StyleFile, origin: Origin) -> Style
     # Photographs stay; in the place of a capture or run stand its views, with masks of what they show.
     rows: list[tuple[Path, Path, float]] = []
     numbers_of = list[range]()
-    names = _names_of(stem_of(path) for path in style.references)
+    names = names_of(stem_of(path) for path in style.references)
     weights = style.weights or (1.0,) * len(style.references)
     masks = style.masks or (NO_MASK,) * len(style.references)
     for path, name, mask, weight in zip(style.references, names, masks, weights, strict=True):
@@ -548,7 +313,7 @@ def _view_rows(
     """
     from ..splats.captures import MAX_REFERENCE_VIEWS, reference_views
 
-    beside = _beside(config)
+    beside = output_of(config)
     folder = beside.parent / f"{stem_of(beside)}.references" / name
     files = []
     for view in range(MAX_REFERENCE_VIEWS):
@@ -559,33 +324,6 @@ def _view_rows(
     for picture, cover, share in zip(pictures, covers, shares, strict=True):
         rows.append((picture, cover, weight * share / sum(shares)))
     return rows
-
-
-def _names_of(stems: Iterable[str]) -> list[str]:
-    """A name for each stem, all different: of stems that agree with their number behind them."""
-    stems = list(stems)
-    counts = Counter(stem.casefold() for stem in stems)
-    names: list[str] = []
-    for number, stem in enumerate(stems):
-        if counts[stem.casefold()] == 1:
-            name = stem
-        else:
-            name = f"{stem}-{number}"
-        names.append(unused_name(name, names))
-    return names
-
-
-def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
-    """The styles with what is added to the names of their files."""
-    if not config.each:
-        return [("", file)] if config.references or config.light_asked else []
-    alone = []
-    # Without dots: x.compressed would make another format of a .ply.
-    names = _names_of(path.stem.replace(".", "_") for path in config.references)
-    for i, path in enumerate(config.references):
-        style = replace(file.style, references=(path,), weights=(), masks=file.style.masks[i : i + 1])
-        alone.append((names[i], file._replace(style=style)))
-    return alone
 
 
 def _write_page(path: Path, config: RestyleConfig, scene: "SplatScene", made: Sequence[_Restyled]) -> None:

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.restyle import RestyleConfig
+from fprf.cli.restyle_outputs import RestyleConfig
 from fprf.cli.style_flags import read_flags
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io import tensorfiles
