@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 import torch
 from kornia.color import lab_to_rgb, rgb_to_lab
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
 from fprf.datamanagers.basis import Basis
 from fprf.errors import DataError
@@ -135,12 +135,29 @@ def flat_look(
     )
 
 
+def _pixels(at: Annotated[Tensor, "M"], size: tuple[int, int]) -> Annotated[Tensor, "M 2"]:
+    """Centres of pixels by number."""
+    return torch.stack([at % size[1], at // size[1]], 1) + 0.5
+
+
+def _points(pixel: Annotated[Tensor, "M 2"], size: tuple[int, int]) -> Annotated[Tensor, "M 3"]:
+    """Points that an eye at the origin sees at pixels of a picture (height, width): its longer side is seen under 53
+    degrees.
+    """
+    away = (pixel - pixel.new_tensor([size[1] / 2, size[0] / 2])) / max(size)
+    return torch.cat([away, torch.ones_like(away[:, :1])], 1)
+
+
 def flat_landmarks(image: Annotated[Tensor, "H W 3"], semantic: Annotated[Tensor, "N D"]) -> Landmarks:
     """The picture as the only view by which photographs of the very place are told."""
     height, width = image.shape[:2]
     at = torch.arange(0, height * width, max(1, height * width // VIEW_SAMPLES))
-    pixel = torch.stack([at % width, at // width], 1) + 0.5
-    samples = ViewSamples(pixel, blurred(image).flatten(0, 1)[at], semantic[at])
+    pixel = _pixels(at, (height, width))
+
+    def rays(pixel: Annotated[Tensor, "M 2"]) -> Annotated[Tensor, "M 3"]:
+        return normalize(_points(pixel, (height, width)), dim=1)
+
+    samples = ViewSamples(pixel, blurred(image).flatten(0, 1)[at], semantic[at], torch.zeros(3), rays)
 
     def closer(view: int) -> Keypoints:
         pixels = image.permute(2, 0, 1)[None]
@@ -155,10 +172,12 @@ def render_flat(flat: Flat, look: Restyle, decoder: Decoder | None) -> Annotated
     """The photograph in a new style, in [0, 1]."""
     parts = []
     decoder = decoder or _Colours()
+    pixels = _pixels(torch.arange(len(flat.content)), flat.size)
     for start in range(0, len(flat.content), _CHUNK):
         rows = slice(start, start + _CHUNK)
         semantic = flat.semantic[rows] if flat.semantic is not None and Want.SEMANTIC in look.needs else None
-        parts.append(look.colour(decoder, flat.content[rows], semantic))
+        points = _points(pixels[rows], flat.size)
+        parts.append(look.colour(decoder, flat.content[rows], semantic, points=points))
     return torch.cat(parts).reshape(*flat.size, 3)
 
 

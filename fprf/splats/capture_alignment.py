@@ -86,6 +86,10 @@ class Placement(NamedTuple):
             harmonics=harmonics,
         )
 
+    def points(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+        """Points of the capture in the joined world."""
+        return points @ self.turn.T.to(points) + self.move.to(points)
+
     def back(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
         """Points of the joined world in the axes of the capture."""
         return (points - self.move) @ self.turn.to(points)

@@ -244,12 +244,14 @@ class Captures:
         look = styled.look
         gaussians = capture.gaussians
         rows = self.rows[index]
+        placement = self.placements[index]
         finite = gaussians.finite
         if not bool(finite.all()):
             gaussians = gaussians.select(finite)
         means = gaussians.means + moved_origin(capture.origin, self.scene.origin)
         if rows.stop - rows.start == len(gaussians):
-            return styled.styled_harmonics(replace(gaussians, means=means), rows)
+            there = replace(gaussians, means=means)
+            return styled.styled_harmonics(there, rows, placement.points(means))
         if look is None:
             return gaussians.harmonics
         # Numbers of the sample that the others take from those near to them.
@@ -258,11 +260,14 @@ class Captures:
         if look.lit:
             found = torch.cat([found.float(), styled.light_gain[rows]], 1)
         # The sample stands where its own capture was moved to: back in its place.
-        near = Neighbours(self.placements[index].back(self.scene.gaussians.means[rows]), found)
+        near = Neighbours(placement.back(self.scene.gaussians.means[rows]), found)
         out = torch.empty_like(gaussians.harmonics)
         for some in pieces(len(out)):
             taken = near(means[some])
-            part = restyled_harmonics(gaussians.harmonics[some], means[some], taken[:, :channels], look)
+            seen_at = placement.points(means[some])
+            part = restyled_harmonics(
+                gaussians.harmonics[some], means[some], taken[:, :channels], look, seen_at
+            )
             if look.lit:
                 part = relit_harmonics(part, taken[:, channels:].float())
             out[some] = part

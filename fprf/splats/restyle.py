@@ -48,8 +48,12 @@ def restyled_harmonics(
     means: Annotated[Tensor, "N 3"],
     semantic: Annotated[Tensor, "N D"],
     look: Restyle,
+    seen_at: Annotated[Tensor, "N 3"] | None = None,
 ) -> Annotated[Tensor, "N K 3"]:
-    """Harmonics of Gaussians in a look. Those that it leaves alone (strength 0) stay, bit for bit."""
+    """Harmonics of Gaussians in a look. Those that it leaves alone (strength 0) stay, bit for bit.
+
+    `seen_at` is where the views of the scene show them; None = at their means.
+    """
     if look.painted_nothing:
         return before
     out = torch.empty_like(before)
@@ -60,6 +64,7 @@ def restyled_harmonics(
         # The change against the identity, A and below it b of each Gaussian (c' = c + c A + b), and how
         # strongly the look acts.
         features = semantic[rows].to(means)
+        points = means[rows] if seen_at is None else seen_at[rows]
         change = features.new_zeros(len(features), 4, 3)
         weight = features.new_zeros(len(features))
         for part in look.parts:
@@ -70,11 +75,11 @@ def restyled_harmonics(
             else:
                 regions = part.regions(features)
             acts = part.share * part.strength * regions
-            added = _added(part, features)
+            added = _added(part, features, points)
             for place, other in part.places:  # a later place lies over those before it
                 inside = place_weight(place, means[rows])[:, None]
                 if bool(inside.any()):
-                    added = torch.lerp(added, _added(other, features), inside[..., None])
+                    added = torch.lerp(added, _added(other, features, points), inside[..., None])
             change = change + acts[..., None] * added
             weight = weight + acts[:, 0]
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
@@ -95,7 +100,9 @@ def all_around(bands: int) -> Directions:
     return Directions(values.T.contiguous(), torch.linalg.pinv(values))
 
 
-def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
+def _added(
+    part: Restyle, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"]
+) -> Annotated[Tensor, "N 4 3"]:
     """A and b of one part at full strength: what its stylizer and colours paint, and the light that falls on
     it.
     """
@@ -106,7 +113,7 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     matched = _matched(part, semantic, belongs)
     if part.placed is None:
         return matched
-    measured = part.placed(semantic, belongs)
+    measured = part.placed(semantic, belongs, points)
     both: Tensor = (1 - measured.share[..., None]) * matched + measured.maps
     return both
 

@@ -162,14 +162,17 @@ class SplatScene(Scene):
             return gaussians
         return gaussians.recoloured(self.styled_harmonics(gaussians, rows))
 
-    def styled_harmonics(self, gaussians: Gaussians, rows: slice | Tensor) -> Annotated[Tensor, "M K 3"]:
-        """Harmonics in the scene's look of some of its Gaussians."""
+    def styled_harmonics(
+        self, gaussians: Gaussians, rows: slice | Tensor, seen_at: Annotated[Tensor, "M 3"] | None = None
+    ) -> Annotated[Tensor, "M K 3"]:
+        """Harmonics in the scene's look of some of its Gaussians; `seen_at` as of `restyled_harmonics`."""
         look = self.look
         if look is None:
             return gaussians.harmonics
         harmonics = gaussians.harmonics
         if not look.painted_nothing:
-            harmonics = restyled_harmonics(harmonics, gaussians.means, self.found().features[rows], look)
+            features = self.found().features[rows]
+            harmonics = restyled_harmonics(harmonics, gaussians.means, features, look, seen_at)
         if look.lit:
             harmonics = relit_harmonics(harmonics, self.light_gain[rows])
         return harmonics
@@ -372,7 +375,17 @@ class SplatScene(Scene):
             at = (drawn.opacity.flatten() > _MIN_SAMPLE_OPACITY).nonzero()[:, 0]
             at = at[:: max(1, len(at) // VIEW_SAMPLES)]
             pixel = torch.stack([at % camera.width, at // camera.width], 1) + 0.5
-            return ViewSamples(pixel, colour[at], semantic[at])
+            middle = seen.cameras.centre[view].double()
+            focal = seen.cameras.focal[view].double()
+            pose = seen.cameras.pose[view].double()
+
+            def rays(pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N 3"]:
+                # As it is drawn: without its lens.
+                plane = (pixel.double() - middle) / focal
+                local = torch.stack([plane[:, 0], -plane[:, 1], -torch.ones_like(plane[:, 0])], 1)
+                return torch.nn.functional.normalize(local @ pose[:, :3].T, dim=1)
+
+            return ViewSamples(pixel, colour[at], semantic[at], pose[:, 3], rays)
 
         @torch.inference_mode()
         def closer(view: int) -> Keypoints:

@@ -475,15 +475,18 @@ class Restyle:
         content: Annotated[Tensor, "N C"],
         semantic: Annotated[Tensor, "N D"] | None,
         plain: Annotated[Tensor, "N 3"] | None = None,
+        points: Annotated[Tensor, "N 3"] | None = None,
     ) -> Annotated[Tensor, "N 3"]:
-        """Colours of points in this look, in [0, 1]; `plain` are those of their content, where they are known."""
+        """Colours of points in this look, in [0, 1]; `plain` are those of their content, and `points` where they
+        lie (world units), where these are known.
+        """
         parts = []
         for part in self.parts:
             if part.share > 0:
                 parts.append(part)
         painted = []
         for part in parts:
-            painted.append(part.painted(content, semantic))
+            painted.append(part.painted(content, semantic, points))
         mixed, luminance = _mixed_features(parts, [each.features for each in painted])
         colour: Tensor = decoder(mixed)
         active = []
@@ -511,7 +514,10 @@ class Restyle:
         return colour
 
     def painted(
-        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+        self,
+        content: Annotated[Tensor, "N C"],
+        semantic: Annotated[Tensor, "N D"] | None,
+        points: Annotated[Tensor, "N 3"] | None = None,
     ) -> "Painted":
         """What this part alone does to features: its stylizer, by its strength and by how sure points are of
         their match.
@@ -532,7 +538,7 @@ class Restyle:
         measured = None
         if self.placed is not None:
             assert semantic is not None, "Want.SEMANTIC was asked for"
-            measured = self.placed(semantic, belongs)
+            measured = self.placed(semantic, belongs, points)
             matched = strength * (1 - measured.share.to(content))
         painted = matched
         paint = None

@@ -1,14 +1,19 @@
 """Light where a reference shows the very place (`placing`): measured point by point, not carried over from
 things of the same kind.
 
-Letters: N points or pairs, D semantic channels, K regions of the scene, R references that show the place.
+Letters: N points or pairs, D semantic channels, K regions of the scene, R references that show the place, J spots.
 Colours are sRGB in [0, 1].
 
-Two things are regressed on what tells points apart, their direction u in semantics and their membership m in
-regions: logarithms of the gains of all pairs of colours, channel by channel, and the colours shown themselves,
+Two things are regressed on what tells points apart, their direction u in semantics, their membership m in regions
+and what they are near to, n: logarithms of the gains of all pairs of colours, channel by channel, and the colours
+shown themselves,
 
-    g(u, m)  =  exp(W u + V m + b),        s(u, m)  =  W' u + V' m + b'
+    g(u, m, n)  =  exp(W u + V m + U n + b),        s(u, m, n)  =  W' u + V' m + U' n + b'
     c'  =  q ((c + o) g - o)  +  (1 - q) s
+
+n are J numbers whose products are the likeness of two points in semantics and direction t from the eye that sees
+what the photograph shows (`Spots`), exp(u u' - 1 + 5 (t t' - 1)): a wall in the shade and another in the sun
+take each the light that is shown beside them, and far from all pairs n is nothing.
 
 where q follows the slope of the colours shown on the colours by gain, both less s, over the pairs of a region, in
 [0, 1]: 1 where the scene's own colours say what the photograph shows; 0 in a sky, whose clouds are others. Where
@@ -36,10 +41,20 @@ _GAIN_RIDGE = 0.003
 """Weight of the squared coefficients beside the mean squared error of a logarithm."""
 _COLOUR_RIDGE = 0.002
 """The same of a colour."""
+_NEAR_COLOUR_RIDGE = 0.02
+"""The same of a colour by what points are near to: with a tenth of it a scene in the wild loses 0.02 dB, and fixed
+cameras gain as much.
+"""
 _THING_CONTRAST = 0.5
 """Share of the contrast that pairs deny things, which these keep nevertheless: with 0 photographs in the wild are
 0.4 dB nearer, and their façades look as in a fog; with 1 0.6 dB further.
 """
+_DIRECTION_WEIGHT = 5.0
+"""Weight of the cosine of directions beside that of semantics: likeness falls to 0.6 at 26 degrees."""
+_SPOTS = 128
+"""Pairs, in even steps through all, that points are near to, at most."""
+_SPOT_RIDGE = 1e-4
+"""Added to the likeness of spots with themselves, 1: a hundredth squared."""
 _APPLIED = 0.85
 """Share of a look that is measured where pairs are many: the rest is matched, and errs elsewhere."""
 _MIN_SURE_PAIRS = 2.0
@@ -69,13 +84,53 @@ class Measured(NamedTuple):
         return torch.cat([torch.diag_embed(self.excess), self.offset[:, None]], 1)
 
 
+class Spots(nn.Module):
+    """What points are near to among the pairs of one photograph: in semantics, and as its eye sees them."""
+
+    keys: Annotated[Tensor, "J D+3"]
+    """Directions in semantics, and weighted ones in the world, side by side."""
+    root: Annotated[Tensor, "J J"]
+    """Likenesses with the spots times this are n."""
+    eye: Annotated[Tensor, "3"]
+
+    def __init__(self, pairs: Pairs, centre: Annotated[Tensor, "D"]) -> None:
+        super().__init__()
+        some = slice(0, None, -(-len(pairs.own) // _SPOTS))
+        keys = _beside(double(unit(pairs.semantic[some].to(centre), centre)), double(pairs.toward[some]))
+        same = _likeness(keys, keys) + _SPOT_RIDGE * torch.eye(len(keys)).to(keys)
+        upper = torch.linalg.cholesky(same).T
+        self.register_buffer("keys", keys.float())
+        self.register_buffer("root", torch.linalg.inv(upper).float())
+        self.register_buffer("eye", pairs.eye.float())
+
+    def forward(
+        self, direction: Annotated[Tensor, "N D"], toward: Annotated[Tensor, "N 3"]
+    ) -> Annotated[Tensor, "N J"]:
+        """Likenesses of points with the spots, in [0, 1], by directions in semantics and from the eye."""
+        return _likeness(_beside(direction, toward.to(direction)), self.keys.to(direction))
+
+    def seen(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+        """Unit directions from the eye to points in the world."""
+        return nn.functional.normalize(points.to(self.eye) - self.eye, dim=1)
+
+
+def _beside(
+    direction: Annotated[Tensor, "N D"], toward: Annotated[Tensor, "N 3"]
+) -> Annotated[Tensor, "N D+3"]:
+    return torch.cat([direction, _DIRECTION_WEIGHT**0.5 * toward], 1)
+
+
+def _likeness(a: Annotated[Tensor, "N D+3"], b: Annotated[Tensor, "J D+3"]) -> Annotated[Tensor, "N J"]:
+    return (a @ b.T - (1 + _DIRECTION_WEIGHT)).exp()
+
+
 class Fit(NamedTuple):
     """Coefficients that pairs of colours at one place give to points described by X numbers."""
 
     gains: Annotated[Tensor, "X 3"]
-    """Coefficients of logarithms of gains: W, V and b."""
+    """Coefficients of logarithms of gains: W, V, b and U."""
     colours: Annotated[Tensor, "X 3"]
-    """Coefficients of the colours shown: W', V' and b'."""
+    """Coefficients of the colours shown: W', V', b' and U'."""
     slopes: Annotated[Tensor, "K"]
     """q of each region."""
 
@@ -83,43 +138,60 @@ class Fit(NamedTuple):
 class PlacedLight(nn.Module):
     """Colours of points by the light that references show at the very place."""
 
-    gains: Annotated[Tensor, "R D+K+1 3"]
-    colours: Annotated[Tensor, "R D+K+1 3"]
     slopes: Annotated[Tensor, "K R"]
     trust: Annotated[Tensor, "K R"]
     """Share of each reference's light that a region takes; rows sum to 1 at most."""
 
-    def __init__(self, scene: SceneStyle, fits: Sequence[Fit], trust: Annotated[Tensor, "K R"]) -> None:
+    def __init__(
+        self, scene: SceneStyle, fits: Sequence[Fit], spots: Sequence[Spots], trust: Annotated[Tensor, "K R"]
+    ) -> None:
         super().__init__()
         self.membership = Membership(scene.keys, scene.semantic_mean)
-        self.register_buffer("gains", torch.stack([each.gains for each in fits]).float())
-        self.register_buffer("colours", torch.stack([each.colours for each in fits]).float())
+        self.spots = nn.ModuleList(spots)
+        for r, (each, near) in enumerate(zip(fits, spots, strict=True)):
+            # Gains and colours side by side, and coefficients of likenesses in the place of those of n.
+            table = torch.cat([each.gains, each.colours], 1)
+            count = len(table) - len(near.keys)
+            table = torch.cat([table[:count], double(near.root) @ table[count:]])
+            self.register_buffer(f"coefficients{r}", table.float())
         self.register_buffer("slopes", torch.stack([each.slopes for each in fits], 1).float())
         self.register_buffer("trust", trust.float())
 
     def forward(
-        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+        self,
+        semantic: Annotated[Tensor, "N D"],
+        belongs: Annotated[Tensor, "N K"] | None = None,
+        points: Annotated[Tensor, "N 3"] | None = None,
     ) -> Measured:
-        """Shares, factors and offsets; `belongs` is the points' membership, where it is known."""
-        semantic = semantic.to(self.gains)
-        belongs = self.membership(semantic) if belongs is None else belongs.to(self.gains)
+        """Shares, factors and offsets; `belongs` is the points' membership, where it is known, and `points` are
+        where they lie (world units). Where that is unknown they are near to nothing.
+        """
+        semantic = semantic.to(self.trust)
+        belongs = self.membership(semantic) if belongs is None else belongs.to(self.trust)
         what = _described(semantic, belongs, self.membership.centre)
+        direction = what[:, : semantic.shape[1]]
         trust = belongs @ self.trust
         slopes = belongs @ self.slopes
         excess = semantic.new_zeros(len(semantic), 3)
         offset = semantic.new_zeros(len(semantic), 3)
-        for r, (gains, colours) in enumerate(zip(self.gains, self.colours, strict=True)):
+        for r in range(self.trust.shape[1]):
             share = trust[:, r, None]
             slope = slopes[:, r, None]
-            gain = _gain(what, gains)
+            table: Tensor = getattr(self, f"coefficients{r}")
+            both = what @ table[: what.shape[1]]
+            if points is not None:
+                spots = self.spots[r]
+                assert isinstance(spots, Spots)  # nn.ModuleList forgets it
+                both = both + spots(direction, spots.seen(points)) @ table[what.shape[1] :]
+            gain = _gain(both[:, :3])
             excess = excess + share * (slope * gain - 1)
-            shown = (what @ colours).clamp(0, 1)
+            shown = both[:, 3:].clamp(0, 1)
             offset = offset + share * (slope * BLACK_OFFSET * (gain - 1) + (1 - slope) * shown)
         return Measured(trust.sum(1, keepdim=True), excess, offset)
 
 
-def _gain(what: Annotated[Tensor, "N X"], gains: Annotated[Tensor, "X 3"]) -> Annotated[Tensor, "N 3"]:
-    return (what @ gains).clamp(_MIN_LOG_GAIN, _MAX_LOG_GAIN).exp()
+def _gain(logarithm: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+    return logarithm.clamp(_MIN_LOG_GAIN, _MAX_LOG_GAIN).exp()
 
 
 def _described(
@@ -133,10 +205,12 @@ def fit(
     own: Annotated[Tensor, "N 3"],
     shown: Annotated[Tensor, "N 3"],
     what: Annotated[Tensor, "N X"],
+    near: Annotated[Tensor, "N J"],
     belongs: Annotated[Tensor, "N K"],
     source: Annotated[Tensor, "K"],
 ) -> Fit:
-    """Light that takes colours `own` to `shown`, by `what` tells the points apart and their regions, float64.
+    """Light that takes colours `own` to `shown`, by `what` tells the points apart, what they are near to, and their
+    regions, float64.
 
     `source` is how far regions are sources of light (`sources`).
     For gains pairs count by how bright they are: what is black in the scene has none to speak of.
@@ -144,30 +218,39 @@ def fit(
     own = double(own)
     shown = double(shown)
     what = double(what)
+    near = double(near)
+    bright = own.mean(1, keepdim=True) + BLACK_OFFSET
+    alike = torch.ones_like(bright)
     logarithm = ((shown + BLACK_OFFSET) / (own + BLACK_OFFSET)).log()
-    gains = _regressed(what, logarithm, own.mean(1, keepdim=True) + BLACK_OFFSET, _GAIN_RIDGE)
-    colours = _regressed(what, shown, torch.ones_like(own[:, :1]), _COLOUR_RIDGE)
-    # q of each region: how far colours by gain, about the mean that is shown, are those shown.
+    # q of each region: how far colours by gain, about the mean that is shown, are those shown. What points are near
+    # to fits clouds, too, and says nothing of that.
+    gains = _regressed(what, logarithm, bright, what.new_full((what.shape[1],), _GAIN_RIDGE))
+    colours = _regressed(what, shown, alike, what.new_full((what.shape[1],), _COLOUR_RIDGE))
     middle = what @ colours
-    contrast = (own + BLACK_OFFSET) * _gain(what, gains) - BLACK_OFFSET - middle
+    contrast = (own + BLACK_OFFSET) * _gain(what @ gains) - BLACK_OFFSET - middle
     both = (contrast * (shown - middle)).sum(1)
     alone = contrast.square().sum(1)
     expected = _MIN_SURE_PAIRS * alone.mean() + torch.finfo(alone.dtype).tiny
     weight = double(belongs).T
     slopes = ((weight @ both + expected) / (weight @ alone + expected)).clamp(0, 1)
     kept = _THING_CONTRAST * (1 - double(source).to(slopes))
-    return Fit(gains, colours, torch.lerp(slopes, torch.ones_like(slopes), kept))
+    slopes = torch.lerp(slopes, torch.ones_like(slopes), kept)
+    every = torch.cat([what, near], 1)
+    ridge = every.new_full((every.shape[1],), _COLOUR_RIDGE)
+    ridge[what.shape[1] :] = _NEAR_COLOUR_RIDGE
+    gains = _regressed(every, logarithm, bright, torch.full_like(ridge, _GAIN_RIDGE))
+    return Fit(gains, _regressed(every, shown, alike, ridge), slopes)
 
 
 def _regressed(
     what: Annotated[Tensor, "N X"],
     value: Annotated[Tensor, "N 3"],
     weight: Annotated[Tensor, "N 1"],
-    ridge: float,
+    ridge: Annotated[Tensor, "X"],
 ) -> Annotated[Tensor, "X 3"]:
     """Coefficients of a weighted ridge regression."""
     weight = weight / weight.sum()
-    normal = what.T @ (weight * what) + ridge * torch.eye(what.shape[1]).to(what)
+    normal = what.T @ (weight * what) + torch.diag(ridge)
     solved: Tensor = torch.linalg.solve(normal, what.T @ (weight * value))
     return solved
 
@@ -191,16 +274,20 @@ def placed_light(
     membership = Membership(scene.keys, scene.semantic_mean)
     source = sources(*(double(part).cpu() for part in colours))
     fits = []
+    spots = []
     trust = []
     for i, pairs in enumerate(dictionary.placed):
         if pairs is not None:
             belongs = membership(pairs.semantic)
             what = _described(pairs.semantic.to(belongs), belongs, membership.centre)
-            fits.append(fit(pairs.own, pairs.shown, what, belongs, source))
+            near = Spots(pairs, membership.centre)
+            n = near(what[:, : pairs.semantic.shape[1]], pairs.toward) @ near.root.to(what)
+            fits.append(fit(pairs.own, pairs.shown, what, n, belongs, source))
+            spots.append(near)
             trust.append(_APPLIED * odds[:, i] * _support(pairs, belongs))
     if not fits:
         return None
-    return PlacedLight(scene, fits, torch.stack(trust, 1))
+    return PlacedLight(scene, fits, spots, torch.stack(trust, 1))
 
 
 def _support(pairs: Pairs, belongs: Annotated[Tensor, "N K"]) -> Annotated[Tensor, "K"]:

@@ -95,6 +95,10 @@ class ViewSamples(NamedTuple):
     colour: Annotated[Tensor, "M 3"]
     semantic: Annotated[Tensor, "M D"]
     """In the scene's basis."""
+    eye: Annotated[Tensor, "3"]
+    """Where the view is seen from, world units."""
+    rays: Callable[[Annotated[Tensor, "N 2"]], Annotated[Tensor, "N 3"]]
+    """Unit directions in the world through pixels, inside of the view or beyond."""
 
 
 class Landmarks(NamedTuple):
@@ -117,6 +121,10 @@ class Pairs(NamedTuple):
     semantic: Annotated[Tensor, "N D"]
     agreeing: int
     """Matches that agree in the best view."""
+    eye: Annotated[Tensor, "3"]
+    """Where the best view is seen from, world units."""
+    toward: Annotated[Tensor, "N 3"]
+    """Unit directions from there."""
 
 
 class Registration(NamedTuple):
@@ -258,13 +266,18 @@ def find_place(
     least = _MIN_VIEW_SHARE * found[0][0].agreeing
     parts = []
     smooth = blurred(image)
+    best = landmarks.samples(found[0][1])
     for each, view in found[:_MAX_VIEWS]:
         if each.agreeing >= least:
-            parts.append(_seen_in(landmarks.samples(view), each, smooth, where))
-    own, shown, semantic = (torch.cat(each) for each in zip(*parts, strict=True))
+            samples = best if view == found[0][1] else landmarks.samples(view)
+            parts.append(_seen_in(samples, each, smooth, where))
+    own, shown, semantic, at = (torch.cat(each) for each in zip(*parts, strict=True))
     if len(own) == 0:
         return None
-    return Pairs(own, shown, semantic, found[0][0].agreeing)
+    # What several views show lies where the best one would see it.
+    matrix = found[0][0].matrix
+    pixel = torch.linalg.solve(matrix[:, :2], (at - matrix[:, 2]).T).T
+    return Pairs(own, shown, semantic, found[0][0].agreeing, best.eye, best.rays(pixel))
 
 
 def _registered(
@@ -307,19 +320,24 @@ def _seen_in(
     known: Registration,
     image: Annotated[Tensor, "H W 3"],
     where: Annotated[Tensor, "H W"] | None,
-) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N D"]]:
-    """Colours of the view and of the photograph, and semantics, of the samples that lie in the photograph."""
+) -> tuple[
+    Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N D"], Annotated[Tensor, "N 2"]
+]:
+    """Colours of the view and of the photograph, and semantics, of the samples that lie in the photograph, and
+    where in it they do.
+    """
     height, width = image.shape[:2]
     at = view.pixel.double() @ known.matrix[:, :2].T + known.matrix[:, 2]
     inside = _within(at, (width, height))
-    x, y = at[inside].long().unbind(1)
+    at = at[inside]
+    x, y = at.long().unbind(1)
     shown = image.cpu()[y, x]
     own = view.colour[inside]
     semantic = view.semantic[inside]
     if where is None:
-        return own, shown, semantic
+        return own, shown, semantic, at
     counts = where.cpu()[y, x]
-    return own[counts], shown[counts], semantic[counts]
+    return own[counts], shown[counts], semantic[counts], at[counts]
 
 
 def blurred(image: Annotated[Tensor, "H W C"]) -> Annotated[Tensor, "H W C"]:

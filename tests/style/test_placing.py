@@ -25,7 +25,8 @@ from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, 
 from fprf.style.files import StyleFile
 from fprf.style.light import BLACK_OFFSET
 from fprf.style.look import Restyle
-from fprf.style.placed_light import PlacedLight, fit, placed_light
+from fprf.style.matching import unit
+from fprf.style.placed_light import PlacedLight, Spots, fit, placed_light
 from fprf.style.placing import (
     Keypoints,
     Landmarks,
@@ -58,11 +59,17 @@ def picture(seed: int) -> Tensor:
     return torch.from_numpy(image)
 
 
+def seen_through(pixel: Tensor) -> Tensor:
+    """Directions of pixels, as a pinhole of 160 pixels of focal length sees them."""
+    away = (pixel - pixel.new_tensor([SIZE[1] / 2, SIZE[0] / 2])) / 160
+    return torch.nn.functional.normalize(torch.cat([away, torch.ones_like(away[:, :1])], 1), dim=1)
+
+
 def landmarks(image: Tensor) -> Landmarks:
     """A picture as the only view; semantics are the places of its pixels."""
     y, x = torch.meshgrid(torch.arange(SIZE[0]) + 0.5, torch.arange(SIZE[1]) + 0.5, indexing="ij")
     pixel = torch.stack([x.flatten(), y.flatten()], 1)
-    samples = ViewSamples(pixel, image.flatten(0, 1), pixel)
+    samples = ViewSamples(pixel, image.flatten(0, 1), pixel, torch.zeros(3), seen_through)
     return Landmarks((view_keypoints(image),), lambda view: samples)
 
 
@@ -77,6 +84,8 @@ def test_a_part_of_the_place_in_another_light_is_found_to_the_pixel() -> None:
     assert pairs is not None and pairs.agreeing >= 20
     inside = (pairs.semantic[:, 0] - left).abs().max() <= 111 and len(pairs.own) > 0.9 * 110 * 90
     assert bool(inside)
+    # The view's own pixels are seen through where they lie: SIFT and the map are right to a fraction of a pixel.
+    assert float((pairs.toward - seen_through(pairs.semantic.double())).abs().max()) < 1e-6
     # What it shows there is the same spot in its light; both sides are compared, one of them as a mean of a box.
     apart = (pairs.shown - relit(pairs.own)).abs().mean()
     anywhere = (pairs.shown.flip(0) - relit(pairs.own)).abs().mean()
@@ -158,7 +167,8 @@ def test_known_gains_are_recovered() -> None:
     true = torch.rand(5, 3, generator=draw, dtype=torch.float64) - 0.5
     own = torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     shown = (own + BLACK_OFFSET) * (what @ true).exp() - BLACK_OFFSET
-    found = fit(own, shown, what, torch.ones(4000, 1), torch.ones(1))
+    nothing = what.new_zeros(4000, 0)
+    found = fit(own, shown, what, nothing, torch.ones(4000, 1), torch.ones(1))
     # The ridge of 0.003 beside a variance of 1/12 takes 3.6 % of the coefficients.
     assert float((found.gains - true).abs().max()) < 0.06 * float(true.abs().max())
     assert float(found.slopes) > 0.98
@@ -172,12 +182,13 @@ def test_a_region_whose_own_colours_say_nothing_takes_the_colours_that_are_shown
     own = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     clouds = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     shown = torch.where(belongs[:, :1] > 0, clouds, 0.5 * own)
-    found = fit(own, shown, what, belongs, torch.ones(2))
+    nothing = what.new_zeros(4000, 0)
+    found = fit(own, shown, what, nothing, belongs, torch.ones(2))
     # The slope of unrelated colours deviates by 1 / sqrt(3 x 2000) = 0.013; two pairs of 2000 are for 1.
     assert abs(float(found.slopes[0])) < 0.06
     assert float(found.slopes[1]) > 0.95
     # As a thing it keeps half of its contrast whatever the photograph shows.
-    thing = fit(own, shown, what, belongs, torch.zeros(2)).slopes
+    thing = fit(own, shown, what, nothing, belongs, torch.zeros(2)).slopes
     assert torch.allclose(thing, (1 + found.slopes) / 2)
     # Of 2000 colours of deviation 0.17 a mean is known to 0.004; the ridge of 0.002 beside a half takes 0.3 %.
     assert float((what[0] @ found.colours - 0.5).abs().max()) < 0.02
@@ -202,7 +213,8 @@ def lit_reference(*kinds: int, name: str = "r") -> Reference:
     kind = torch.arange(len(colour)) % 2
     some = torch.isin(kind, torch.tensor(kinds))
     shown = (colour + BLACK_OFFSET) * GAIN[kind] - BLACK_OFFSET
-    pairs = Pairs(colour[some], shown[some], semantic[some], 20)
+    ahead = torch.tensor([0.0, 0.0, 1.0]).expand(int(some.sum()), 3)
+    pairs = Pairs(colour[some], shown[some], semantic[some], 20, torch.zeros(3), ahead)
     other = 1 - colour
     return Reference(name, other, semantic, colour=other, placed=pairs)
 
@@ -225,7 +237,8 @@ def placed_of(scene: SceneStyle, *references: Reference) -> PlacedLight:
 def test_points_take_the_gain_of_their_kind_and_what_was_not_seen_is_left() -> None:
     _, semantic, scene = scene_of()
     kind = torch.arange(len(semantic)) % 2
-    measured = placed_of(scene, lit_reference(0, 1))(semantic)
+    ahead = torch.tensor([0.0, 0.0, 1.0]).expand(len(semantic), 3)
+    measured = placed_of(scene, lit_reference(0, 1))(semantic, None, ahead)
     assert 0.8 < float(measured.share.min()) <= float(measured.share.max()) < 1
     colour = scene_of()[0]
     lit = colour + measured.change(colour) / measured.share
@@ -258,6 +271,68 @@ def test_several_references_share_by_weight_and_what_is_forbidden_is_not_taken()
     assert [each is None for each in joined.placed] == [each is None for each in d.placed]
 
 
+def sunny_and_shaded() -> tuple[Tensor, SceneStyle, Pairs]:
+    """One kind of wall: the left of it was in the light of the right, and is shown in half of it."""
+    draw = torch.Generator().manual_seed(2)
+    colour, semantic, scene = scene_of(1000)
+    away = 2 * torch.rand(len(colour), 2, generator=draw) - 1
+    points = torch.cat([away, torch.ones_like(away[:, :1])], 1)
+    gain = torch.where(points[:, :1] < 0, 0.5, 1.0)
+    shown = (colour + BLACK_OFFSET) * gain - BLACK_OFFSET
+    eye = torch.tensor([3.0, -1.0, 2.0])
+    toward = torch.nn.functional.normalize(points, dim=1)
+    return points + eye, scene, Pairs(colour, shown, semantic, 20, eye, toward)
+
+
+def test_shade_and_sun_on_things_of_one_kind_are_told_by_where_they_lie() -> None:
+    points, scene, pairs = sunny_and_shaded()
+    reference = Reference("r", 1 - pairs.own, pairs.semantic, colour=1 - pairs.own, placed=pairs)
+    placed = placed_of(scene, reference)
+
+    def lit(points: Tensor | None) -> Tensor:
+        measured = placed(pairs.semantic, None, points)
+        return pairs.own + measured.change(pairs.own) / measured.share
+
+    # Without places all take a mean of both; away from the edge, which likeness smooths over, each is its own.
+    sure = (points - pairs.eye)[:, 0].abs() > 0.25
+    unplaced = float((lit(None) - pairs.shown)[sure].abs().mean())
+    assert float((lit(points) - pairs.shown)[sure].abs().mean()) < 0.5 * unplaced
+    # Twice as far in the same direction is seen there, too, and behind the eye nothing is near.
+    assert torch.allclose(lit(pairs.eye + 2 * (points - pairs.eye)), lit(points), atol=1e-3)
+    assert torch.allclose(lit(2 * pairs.eye - points), lit(None), atol=0.02)
+
+
+def test_what_points_are_near_to_has_their_likeness_for_a_product() -> None:
+    """n of two spots, multiplied, against the formula in float64."""
+    _, scene, pairs = sunny_and_shaded()
+    centre = scene.semantic_mean
+    spots = Spots(pairs, centre)
+    some = slice(0, None, 8)
+    assert len(spots.keys) == 125
+    direction = unit(pairs.semantic[some], centre).double()
+    toward = pairs.toward[some].double()
+    n = spots(direction, toward) @ spots.root.double()
+    wanted = (direction @ direction.T + 5 * (toward @ toward.T) - 6).exp()
+    # The ridge of 1e-4 takes as much of each spot's own; roots in float32 are of matrices of a condition of 1e6.
+    assert float((n @ n.T - wanted).abs().max()) < 2e-3
+
+
+def test_gaussians_of_captures_are_lit_where_the_views_show_them() -> None:
+    points, scene, pairs = sunny_and_shaded()
+    d = dictionary_of(Reference("r", 1 - pairs.own, pairs.semantic, colour=1 - pairs.own, placed=pairs))
+    stylizer = AdainConfig().build(dictionary=d, scene=scene)
+    look = Restyle(stylizer, placed=placed_light(scene, d, EVERYWHERE, colours_of(scene)))
+    harmonics = ((pairs.own - 0.5) / HARMONIC)[:, None]
+    here = restyled_harmonics(harmonics, points, pairs.semantic, look)
+    moved = restyled_harmonics(harmonics, points + 7, pairs.semantic, look, points)
+    assert torch.equal(here, moved)
+    assert not torch.allclose(here, restyled_harmonics(harmonics, points + 7, pairs.semantic, look))
+    drawn = as_drawn(here, all_around(1))[:, 0] * HARMONIC + 0.5
+    flat = look.colour(lambda content: content, pairs.own, pairs.semantic, points=points)  # type: ignore[arg-type]
+    inside = ((drawn > 0.01) & (drawn < 0.99)).all(1)
+    assert torch.allclose(drawn[inside], flat[inside], atol=1e-4)
+
+
 def test_fields_and_gaussians_take_the_same_and_strength_scales_it() -> None:
     colour, semantic, scene = scene_of()
     d = dictionary_of(lit_reference(0, 1))
@@ -271,7 +346,8 @@ def test_fields_and_gaussians_take_the_same_and_strength_scales_it() -> None:
         return as_drawn(restyled, all_around(1))[:, 0] * HARMONIC + 0.5
 
     def shown(look: Restyle) -> Tensor:
-        return look.colour(lambda content: content, colour, semantic)  # type: ignore[arg-type]
+        at = torch.zeros_like(colour)
+        return look.colour(lambda content: content, colour, semantic, points=at)  # type: ignore[arg-type]
 
     both = drawn(look)
     inside = ((both > 0.01) & (both < 0.99)).all(1)
@@ -354,5 +430,7 @@ def test_what_earlier_versions_found_is_read_and_places_nothing(scene: Scene) ->
 
 def test_no_keypoints_match_nothing() -> None:
     none = Keypoints(torch.zeros(0, 2), torch.zeros(0, 128, dtype=torch.uint8))
-    blank = Landmarks((none,), lambda view: ViewSamples(*(torch.zeros(0, 2),) * 3))
+    blank = Landmarks(
+        (none,), lambda view: ViewSamples(*(torch.zeros(0, 2),) * 3, torch.zeros(3), seen_through)
+    )
     assert find_place(blank, picture(0)) is None
