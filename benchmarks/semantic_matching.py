@@ -33,7 +33,7 @@ from fprf.interfaces import Encoder
 from fprf.ops.config import GuidedConfig
 from fprf.plugins.encoders.config import SEMANTICS, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.dictionary import Reference, build_dictionary, semantic_samples
+from fprf.style.dictionary import Reference, build_dictionary, semantics_of
 from fprf.style.light import light_of
 from fprf.style.scene_style import scene_style
 
@@ -368,7 +368,7 @@ def _sampled(
     )
     x = x.flatten()
     y = y.flatten()
-    semantic, beyond = semantic_samples(image, torch.stack([x, y], 1), encoder, basis, GuidedConfig())
+    semantic, beyond = semantics_of(image, encoder, basis, GuidedConfig())(torch.stack([x, y], 1))
     kinds = painted[y * painted.shape[0] // height, x * painted.shape[1] // width]
     return semantic, beyond, image[y, x], kinds
 

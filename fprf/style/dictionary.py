@@ -13,7 +13,7 @@ cells change them by 0.6 % at most, and cost a fifth.
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -31,7 +31,7 @@ from ..io.atomic import write_bytes
 from ..ops.backend import double, float32_convolutions
 from ..ops.config import GuidedConfig
 from ..ops.guided import apply, coefficients
-from .placing import Keypoints, Landmarks, Pairs, close_keypoints, close_size, find_place
+from .placing import Keypoints, Landmarks, Pairs, close_keypoints, close_size, find_place, weighed
 from .statistics import covariance, group_moments, kmeans, mix, moments
 
 if TYPE_CHECKING:
@@ -119,14 +119,18 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, mask: Path |
         chosen = _within_mask(_read_mask(mask, path, cutout.pixels, size), chosen, mask, path)
     image = torch.from_numpy(reduced).to(encoders.device).float() / 255
     pixel = (_grid_pixels(size) if chosen is None else _every_nth_pixel(chosen)).to(image.device)
-    content = _filtered(_encode(encoders.content, image), image, pixel, encoders.guided)
+    content = _filtered(_encode(encoders.content, image), image, encoders.guided)(pixel)
     colour = image[pixel[:, 1], pixel[:, 0]]
     if encoders.semantic is None or encoders.basis is None:
         return Reference(name, content, content.new_zeros(len(content), 0), colour=colour)
-    semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
+    semantics = semantics_of(image, encoders.semantic, encoders.basis, encoders.guided)
+    semantic, beyond = semantics(pixel)
     placed = None
     if encoders.landmarks is not None:
         placed = find_place(encoders.landmarks, image, chosen, lambda: _close_keypoints(cutout, size, chosen))
+    if placed is not None:
+        there, _ = semantics(placed.pixel.to(pixel))
+        placed = weighed(placed, there, encoders.scene_style.semantic_mean.to(placed.semantic))
     return Reference(name, content, semantic, colour=colour, beyond=beyond, placed=placed)
 
 
@@ -192,23 +196,24 @@ def _every_nth_pixel(chosen: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2
     return pixel[step // 2 :: step]
 
 
-def semantic_samples(
-    image: Annotated[Tensor, "H W 3"],
-    pixel: Annotated[Tensor, "N 2"],
-    encoder: Encoder,
-    basis: "Basis",
-    guided: GuidedConfig,
-) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "N"]]:
-    """Sample filtered semantics at pixels (x, y, int64) in a scene's basis, and what lies beyond it
-    (`Basis.beyond`).
+def semantics_of(
+    image: Annotated[Tensor, "H W 3"], encoder: Encoder, basis: "Basis", guided: GuidedConfig
+) -> Callable[[Annotated[Tensor, "N 2"]], tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "N"]]]:
+    """Encode a photograph: what comes back gives filtered semantics at pixels (x, y, int64) in a scene's basis, and what
+    lies beyond it (`Basis.beyond`).
     """
     maps = _encode(encoder, image)
     cells = maps.flatten(1).T
     low = basis.project(cells)
     # Projecting is linear and so is the filter: fewer channels first.
     fewer = torch.cat([low, basis.beyond(cells, low)], 1).T.reshape(-1, *maps.shape[1:])
-    samples = _filtered(fewer, image, pixel, guided)
-    return samples[:, :-1].contiguous(), samples[:, -1].clamp_min(0)
+    filtered = _filtered(fewer, image, guided)
+
+    def samples(pixel: Annotated[Tensor, "N 2"]) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "N"]]:
+        found = filtered(pixel)
+        return found[:, :-1].contiguous(), found[:, -1].clamp_min(0)
+
+    return samples
 
 
 def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "C h w"]:
@@ -218,20 +223,20 @@ def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Te
 
 
 def _filtered(
-    maps: Annotated[Tensor, "C h w"],
-    image: Annotated[Tensor, "H W 3"],
-    pixel: Annotated[Tensor, "N 2"],
-    guided: GuidedConfig,
-) -> Annotated[Tensor, "N C"]:
-    """Apply the guided filter at pixels (x, y, int64)."""
+    maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], guided: GuidedConfig
+) -> Callable[[Annotated[Tensor, "N 2"]], Annotated[Tensor, "N C"]]:
+    """The guided filter of a picture; what comes back applies it at pixels (x, y, int64)."""
     height, width = image.shape[:2]
     radius = round(guided.radius * min(height, width))
     cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_FILTER_CELL_PIXELS)
-    parts = torch.split(pixel, _FILTERED_ROWS)
-    rows = []
-    for at in parts:
-        rows.append(apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)))
-    return torch.cat(rows)
+
+    def at(pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
+        rows = []
+        for part in torch.split(pixel, _FILTERED_ROWS):
+            rows.append(apply(cells, part + 0.5, image[part[:, 1], part[:, 0]], (height, width)))
+        return torch.cat(rows)
+
+    return at
 
 
 def _read_mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:

@@ -18,7 +18,8 @@ take each the light that is shown beside them, and far from all pairs n is nothi
 where q follows the slope of the colours shown on the colours by gain, both less s, over the pairs of a region, in
 [0, 1]: 1 where the scene's own colours say what the photograph shows; 0 in a sky, whose clouds are others. Where
 views and photograph do not quite lie on each other the slope is small, too, but things keep their contrast: of what
-is missing to 1 they take half. Within a region façades differ from roofs. All this
+is missing to 1 they take half. Things are rough, in the scene and in the photograph. Pairs whose semantics differ
+count less: a branch before the sky is none of it. Within a region façades differ from roofs. All this
 needs no statistics of regions, so that nothing else that a region holds shows in it, and extends to what the
 photograph does not show. It is affine in the colour c. Regions take it as far as pairs lie in them; the rest stays
 as matching would have it.
@@ -36,6 +37,7 @@ from .light import BLACK_OFFSET, sources
 from .matching import unit
 from .placing import Pairs
 from .scene_style import Membership, SceneStyle
+from .statistics import group_moments
 
 _GAIN_RIDGE = 0.003
 """Weight of the squared coefficients beside the mean squared error of a logarithm."""
@@ -58,7 +60,7 @@ _SPOT_RIDGE = 1e-4
 _APPLIED = 0.85
 """Share of a look that is measured where pairs are many: the rest is matched, and errs elsewhere."""
 _MIN_SURE_PAIRS = 2.0
-"""Pairs in a region with which it takes half of that; it has so many of average contrast for the slope 1, too."""
+"""Pairs in a region with which it takes half of that, and half of the slope that they say: without any it is 1."""
 _MIN_LOG_GAIN = -4.0
 """Least logarithm of a gain: a night is a fiftieth as bright as a white sky."""
 _MAX_LOG_GAIN = 1.5
@@ -202,54 +204,58 @@ def _described(
 
 
 def fit(
-    own: Annotated[Tensor, "N 3"],
-    shown: Annotated[Tensor, "N 3"],
+    pairs: Pairs,
     what: Annotated[Tensor, "N X"],
     near: Annotated[Tensor, "N J"],
     belongs: Annotated[Tensor, "N K"],
     source: Annotated[Tensor, "K"],
 ) -> Fit:
-    """Light that takes colours `own` to `shown`, by `what` tells the points apart, what they are near to, and their
-    regions, float64.
+    """Light that takes a scene's colours to those that a photograph shows, by `what` tells the points apart, what they
+    are near to, and their regions, float64.
 
-    `source` is how far regions are sources of light (`sources`).
-    For gains pairs count by how bright they are: what is black in the scene has none to speak of.
+    `source` is how far regions are sources of light (`sources`). Pairs count by their weight, and for gains by
+    how bright they are, too: what is black in the scene has none to speak of.
     """
-    own = double(own)
-    shown = double(shown)
+    own = double(pairs.own)
+    shown = double(pairs.shown)
     what = double(what)
     near = double(near)
-    bright = own.mean(1, keepdim=True) + BLACK_OFFSET
-    alike = torch.ones_like(bright)
+    counts = double(pairs.weight)
+    bright = counts * (own.mean(1) + BLACK_OFFSET)
     logarithm = ((shown + BLACK_OFFSET) / (own + BLACK_OFFSET)).log()
     # q of each region: how far colours by gain, about the mean that is shown, are those shown. What points are near
     # to fits clouds, too, and says nothing of that.
     gains = _regressed(what, logarithm, bright, what.new_full((what.shape[1],), _GAIN_RIDGE))
-    colours = _regressed(what, shown, alike, what.new_full((what.shape[1],), _COLOUR_RIDGE))
+    colours = _regressed(what, shown, counts, what.new_full((what.shape[1],), _COLOUR_RIDGE))
     middle = what @ colours
     contrast = (own + BLACK_OFFSET) * _gain(what @ gains) - BLACK_OFFSET - middle
-    both = (contrast * (shown - middle)).sum(1)
-    alone = contrast.square().sum(1)
-    expected = _MIN_SURE_PAIRS * alone.mean() + torch.finfo(alone.dtype).tiny
-    weight = double(belongs).T
-    slopes = ((weight @ both + expected) / (weight @ alone + expected)).clamp(0, 1)
-    kept = _THING_CONTRAST * (1 - double(source).to(slopes))
-    slopes = torch.lerp(slopes, torch.ones_like(slopes), kept)
+    tiny = torch.finfo(own.dtype).tiny
+    weight = double(belongs).T * counts
+    count = weight.sum(1)
+    mean = weight / count.clamp_min(tiny)[:, None]
+    alone = mean @ contrast.square().sum(1) + tiny
+    both = mean @ (contrast * (shown - middle)).sum(1)
+    sure = _sure(count)
+    slopes = torch.lerp(torch.ones_like(sure), both / alone, sure).clamp(0, 1)
+    # A sky of many captured skies is rough, and smooth in the photograph.
+    smooth = sources(*group_moments(shown, weight.T)[:2])
+    thing = 1 - double(source).to(smooth).maximum(sure * smooth)
+    slopes = torch.lerp(slopes, torch.ones_like(slopes), _THING_CONTRAST * thing)
     every = torch.cat([what, near], 1)
     ridge = every.new_full((every.shape[1],), _COLOUR_RIDGE)
     ridge[what.shape[1] :] = _NEAR_COLOUR_RIDGE
     gains = _regressed(every, logarithm, bright, torch.full_like(ridge, _GAIN_RIDGE))
-    return Fit(gains, _regressed(every, shown, alike, ridge), slopes)
+    return Fit(gains, _regressed(every, shown, counts, ridge), slopes)
 
 
 def _regressed(
     what: Annotated[Tensor, "N X"],
     value: Annotated[Tensor, "N 3"],
-    weight: Annotated[Tensor, "N 1"],
+    weight: Annotated[Tensor, "N"],
     ridge: Annotated[Tensor, "X"],
 ) -> Annotated[Tensor, "X 3"]:
     """Coefficients of a weighted ridge regression."""
-    weight = weight / weight.sum()
+    weight = (weight / weight.sum().clamp_min(torch.finfo(weight.dtype).tiny))[:, None]
     normal = what.T @ (weight * what) + torch.diag(ridge)
     solved: Tensor = torch.linalg.solve(normal, what.T @ (weight * value))
     return solved
@@ -282,7 +288,7 @@ def placed_light(
             what = _described(pairs.semantic.to(belongs), belongs, membership.centre)
             near = Spots(pairs, membership.centre)
             n = near(what[:, : pairs.semantic.shape[1]], pairs.toward) @ near.root.to(what)
-            fits.append(fit(pairs.own, pairs.shown, what, n, belongs, source))
+            fits.append(fit(pairs, what, n, belongs, source))
             spots.append(near)
             trust.append(_APPLIED * odds[:, i] * _support(pairs, belongs))
     if not fits:
@@ -292,5 +298,9 @@ def placed_light(
 
 def _support(pairs: Pairs, belongs: Annotated[Tensor, "N K"]) -> Annotated[Tensor, "K"]:
     """Trust in each region by the number of its pairs, in [0, 1), float64."""
-    count = double(belongs).sum(0)
+    return _sure(double(pairs.weight).to(belongs.device) @ double(belongs))
+
+
+def _sure(count: Annotated[Tensor, "K"]) -> Annotated[Tensor, "K"]:
+    """How far so many pairs are believed, in [0, 1)."""
     return count / (count + _MIN_SURE_PAIRS)

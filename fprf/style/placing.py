@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError
+from .matching import unit
 
 _VIEW_KEYPOINTS = 500
 """Keypoints of a view, at most: matching those of 32 views with a photograph takes 0.06 s."""
@@ -73,6 +74,10 @@ _REFINEMENTS = 3
 """Fits of the affine map, each to the matches that agree with the one before."""
 VIEW_SAMPLES = 4096
 """Pixels of a view whose colours are compared, about."""
+_MAX_OTHER_COSINE = 0.3
+"""Cosine of semantics of scene and photograph up to which these show two things."""
+_MIN_SAME_COSINE = 0.5
+"""Cosine from which on they show one."""
 _BLURRED_SHARE = 0.01
 """Half a side of the box that colours are means of on both sides, as a share of the longer side of a picture:
 about what the map is off by.
@@ -119,12 +124,17 @@ class Pairs(NamedTuple):
     own: Annotated[Tensor, "N 3"]
     shown: Annotated[Tensor, "N 3"]
     semantic: Annotated[Tensor, "N D"]
+    """Of the scene."""
     agreeing: int
     """Matches that agree in the best view."""
     eye: Annotated[Tensor, "3"]
     """Where the best view is seen from, world units."""
     toward: Annotated[Tensor, "N 3"]
     """Unit directions from there."""
+    pixel: Annotated[Tensor, "N 2"]
+    """Where in the photograph (x, y, int64)."""
+    weight: Annotated[Tensor, "N"]
+    """How far the photograph shows there what the scene has, and nothing that stands before it, in [0, 1]."""
 
 
 class Registration(NamedTuple):
@@ -277,7 +287,19 @@ def find_place(
     # What several views show lies where the best one would see it.
     matrix = found[0][0].matrix
     pixel = torch.linalg.solve(matrix[:, :2], (at - matrix[:, 2]).T).T
-    return Pairs(own, shown, semantic, found[0][0].agreeing, best.eye, best.rays(pixel))
+    ones = torch.ones(len(own))
+    return Pairs(own, shown, semantic, found[0][0].agreeing, best.eye, best.rays(pixel), at.long(), ones)
+
+
+def weighed(pairs: Pairs, there: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Pairs:
+    """The pairs, each by how alike semantics of the scene and of the photograph are: `there` at their pixels, `centre` is
+    that of the scene's.
+
+    A branch before the sky, people on stairs and all else that only the photograph has are seen by that.
+    """
+    alike = (unit(pairs.semantic, centre) * unit(there.to(pairs.semantic), centre)).sum(1)
+    weight = (alike - _MAX_OTHER_COSINE) / (_MIN_SAME_COSINE - _MAX_OTHER_COSINE)
+    return pairs._replace(weight=weight.clamp(0, 1))
 
 
 def _registered(
@@ -323,8 +345,8 @@ def _seen_in(
 ) -> tuple[
     Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N D"], Annotated[Tensor, "N 2"]
 ]:
-    """Colours of the view and of the photograph, and semantics, of the samples that lie in the photograph, and
-    where in it they do.
+    """Colours of the view and of the photograph, semantics of the view and pixels (x, y) of the photograph, of the
+    samples that lie in the photograph.
     """
     height, width = image.shape[:2]
     at = view.pixel.double() @ known.matrix[:, :2].T + known.matrix[:, 2]

@@ -39,6 +39,7 @@ from fprf.style.placing import (
     keypoint_tensors,
     keypoints_from,
     view_keypoints,
+    weighed,
 )
 from fprf.style.restyle import apply_style
 from fprf.style.scene_style import SceneStyle, scene_style
@@ -90,6 +91,9 @@ def test_a_part_of_the_place_in_another_light_is_found_to_the_pixel() -> None:
     apart = (pairs.shown - relit(pairs.own)).abs().mean()
     anywhere = (pairs.shown.flip(0) - relit(pairs.own)).abs().mean()
     assert float(apart) < 0.3 * float(anywhere)
+    # Semantics of the samples are their positions in the view: the photograph's pixels are those less its corner.
+    off = pairs.pixel + 0.5 + torch.tensor([left, top]) - pairs.semantic[:, :2]
+    assert float(off.abs().max()) < 3
 
 
 @pytest.mark.parametrize("seed", range(1, 6))
@@ -160,6 +164,14 @@ def test_keypoints_go_through_a_file_and_damage_is_told() -> None:
         keypoints_from({"count": tensors["count"]})
 
 
+def pairs_of(own: Tensor, shown: Tensor, semantic: Tensor | None = None) -> Pairs:
+    """Pairs that count all alike, seen in one direction."""
+    count = len(own)
+    kind = own.new_zeros(count, 0) if semantic is None else semantic
+    ahead = torch.tensor([0.0, 0.0, 1.0]).expand(count, 3)
+    return Pairs(own, shown, kind, 20, torch.zeros(3), ahead, torch.zeros(count, 2).long(), torch.ones(count))
+
+
 def test_known_gains_are_recovered() -> None:
     """Of colours that were lit by gains that follow from what is known of points: own colours say it all."""
     draw = torch.Generator().manual_seed(0)
@@ -168,7 +180,7 @@ def test_known_gains_are_recovered() -> None:
     own = torch.rand(4000, 3, generator=draw, dtype=torch.float64)
     shown = (own + BLACK_OFFSET) * (what @ true).exp() - BLACK_OFFSET
     nothing = what.new_zeros(4000, 0)
-    found = fit(own, shown, what, nothing, torch.ones(4000, 1), torch.ones(1))
+    found = fit(pairs_of(own, shown), what, nothing, torch.ones(4000, 1), torch.ones(1))
     # The ridge of 0.003 beside a variance of 1/12 takes 3.6 % of the coefficients.
     assert float((found.gains - true).abs().max()) < 0.06 * float(true.abs().max())
     assert float(found.slopes) > 0.98
@@ -179,19 +191,55 @@ def test_a_region_whose_own_colours_say_nothing_takes_the_colours_that_are_shown
     draw = torch.Generator().manual_seed(0)
     belongs = torch.eye(2, dtype=torch.float64)[torch.arange(4000) % 2]
     what = torch.cat([belongs, torch.ones(4000, 1)], 1)
-    own = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
-    clouds = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
+    own = 0.2 + 0.6 * torch.rand(4000, 1, generator=draw, dtype=torch.float64).expand(4000, 3)
+    clouds = 0.2 + 0.6 * torch.rand(4000, 1, generator=draw, dtype=torch.float64).expand(4000, 3)
     shown = torch.where(belongs[:, :1] > 0, clouds, 0.5 * own)
     nothing = what.new_zeros(4000, 0)
-    found = fit(own, shown, what, nothing, belongs, torch.ones(2))
-    # The slope of unrelated colours deviates by 1 / sqrt(3 x 2000) = 0.013; two pairs of 2000 are for 1.
+    found = fit(pairs_of(own, shown), what, nothing, belongs, torch.ones(2))
+    # The slope of unrelated colours deviates by 1 / sqrt(2000) = 0.022; two pairs of 2000 are for 1.
     assert abs(float(found.slopes[0])) < 0.06
     assert float(found.slopes[1]) > 0.95
     # As a thing it keeps half of its contrast whatever the photograph shows.
-    thing = fit(own, shown, what, nothing, belongs, torch.zeros(2)).slopes
+    thing = fit(pairs_of(own, shown), what, nothing, belongs, torch.zeros(2)).slopes
     assert torch.allclose(thing, (1 + found.slopes) / 2)
     # Of 2000 colours of deviation 0.17 a mean is known to 0.004; the ridge of 0.002 beside a half takes 0.3 %.
     assert float((what[0] @ found.colours - 0.5).abs().max()) < 0.02
+
+
+def test_a_smooth_sky_in_the_photograph_takes_nothing_of_a_rough_one() -> None:
+    """A sky of many captured skies is rough, and counts as a thing by its own colours."""
+    draw = torch.Generator().manual_seed(0)
+    own = 0.2 + 0.6 * torch.rand(4000, 3, generator=draw, dtype=torch.float64)
+    shown = torch.tensor([0.5, 0.6, 0.8]) + 0.01 * torch.randn(4000, 3, generator=draw, dtype=torch.float64)
+    what = torch.ones(4000, 1, dtype=torch.float64)
+    found = fit(pairs_of(own, shown), what, what[:, :0], torch.ones(4000, 1), torch.zeros(1))
+    # Two pairs of 4002 are for 1.
+    assert float(found.slopes) < 0.01
+
+
+def test_what_stands_before_a_thing_does_not_light_it() -> None:
+    """Half of the pairs show branches, dark, before a sky."""
+    draw = torch.Generator().manual_seed(0)
+    own = 0.6 + 0.2 * torch.rand(400, 3, generator=draw)
+    shown = 0.9 * own
+    branch = torch.arange(400) % 2 == 0
+    shown[branch] = 0.1
+    sky = torch.eye(4)[0].expand(400, 4)
+    there = torch.where(branch[:, None], torch.eye(4)[1], sky)
+    told = weighed(pairs_of(own, shown, sky), there, torch.zeros(4))
+    assert told.weight.tolist() == (~branch).float().tolist()
+    what = torch.ones(400, 1)
+    found = fit(told, what, what[:, :0], torch.ones(400, 1), torch.ones(1))
+    alone = fit(
+        pairs_of(own[~branch], shown[~branch]), what[:200], what[:200, :0], torch.ones(200, 1), torch.ones(1)
+    )
+    for one, other in zip(found, alone, strict=True):
+        assert torch.allclose(one, other)
+    # Where nothing at all is the same, nothing is measured.
+    nothing = fit(
+        told._replace(weight=torch.zeros(400)), what, what[:, :0], torch.ones(400, 1), torch.ones(1)
+    )
+    assert float(nothing.gains.abs().max()) == 0 and float(nothing.slopes) == 1
 
 
 def scene_of(count: int = 400) -> tuple[Tensor, Tensor, SceneStyle]:
@@ -213,8 +261,7 @@ def lit_reference(*kinds: int, name: str = "r") -> Reference:
     kind = torch.arange(len(colour)) % 2
     some = torch.isin(kind, torch.tensor(kinds))
     shown = (colour + BLACK_OFFSET) * GAIN[kind] - BLACK_OFFSET
-    ahead = torch.tensor([0.0, 0.0, 1.0]).expand(int(some.sum()), 3)
-    pairs = Pairs(colour[some], shown[some], semantic[some], 20, torch.zeros(3), ahead)
+    pairs = pairs_of(colour[some], shown[some], semantic[some])
     other = 1 - colour
     return Reference(name, other, semantic, colour=other, placed=pairs)
 
@@ -281,7 +328,8 @@ def sunny_and_shaded() -> tuple[Tensor, SceneStyle, Pairs]:
     shown = (colour + BLACK_OFFSET) * gain - BLACK_OFFSET
     eye = torch.tensor([3.0, -1.0, 2.0])
     toward = torch.nn.functional.normalize(points, dim=1)
-    return points + eye, scene, Pairs(colour, shown, semantic, 20, eye, toward)
+    pairs = pairs_of(colour, shown, semantic)._replace(eye=eye, toward=toward)
+    return points + eye, scene, pairs
 
 
 def test_shade_and_sun_on_things_of_one_kind_are_told_by_where_they_lie() -> None:
