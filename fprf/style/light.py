@@ -54,8 +54,12 @@ _MAX_RIVAL_SHARE = 0.8
 _NEAREST_SHARE = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
 APPLIED = 0.6
-"""Share of the estimated exposure of things and of the cast that is applied: both are drawn to no change,
-since a few matches know the light of another place within limits.
+"""Share of the estimated exposure of things, of the cast and of the change of saturation (in logarithms) that is
+applied: they are drawn to no change, since a few matches know the light of another place within limits.
+"""
+_COLOURFUL_SHARE = 0.1
+"""Share of the references and of the scene whose saturation is compared, the most colourful. By eye: with a half a
+garden by photographs of roads lost the colours of its plants.
 """
 _MAX_SOURCE_ROUGHNESS = 0.12
 """Deviation of luma, relative to it, up to which a region is a source of light: skies lie below, by eye."""
@@ -410,7 +414,7 @@ def light_maps(
     gain = gain.minimum((_MAX_EXPOSED_LUMA / (own + deviation)).clamp_min(1.0))
     balance = _white_balance(mean, share, codes, odds, axes)
     # Saturation s of the references against the scene's, and S = (s I + (1 - s) L) diag(g).
-    change = _saturation(codes, odds) / _saturation(mean, share)
+    change = (_saturation(codes, odds) / _saturation(mean, share)) ** APPLIED
     change = change.clamp(_MIN_SATURATION_GAIN, _MAX_SATURATION_GAIN)
     softer = torch.lerp(torch.ones_like(source), source.new_tensor(_SOURCE_SATURATION_GAIN), source)
     saturation = (change * softer)[:, None, None]
@@ -510,11 +514,13 @@ def _quantile(value: Tensor, weight: Tensor, at: float) -> float:
 
 
 def _saturation(colour: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "N"]) -> Tensor:
-    """Median distance of colours from grey, relative to their luma; never 0."""
+    """Distance of colours from grey, relative to their luma, that a tenth has at least; never 0.
+
+    Roads and skies are grey in any light: the most colourful things tell black and white, and fog.
+    """
     grey = luma(colour)
-    return torch.tensor(
-        _quantile((colour - grey).abs().amax(1) / (grey[:, 0] + BLACK_OFFSET), weight, 0.5) + BLACK_OFFSET
-    )
+    apart = (colour - grey).abs().amax(1) / (grey[:, 0] + BLACK_OFFSET)
+    return torch.tensor(_quantile(apart, weight, 1 - _COLOURFUL_SHARE) + BLACK_OFFSET)
 
 
 def _spread(scene: SceneStyle) -> float:

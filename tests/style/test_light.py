@@ -192,6 +192,25 @@ def test_a_kind_that_a_reference_lacks_keeps_its_own_chroma() -> None:
     assert float(torch.nn.functional.cosine_similarity(before, after, dim=0)) > 0.99
 
 
+def test_roads_take_no_colour_and_black_and_white_does() -> None:
+    """Grey things beside one as colourful as the scene's are material; nothing but grey ones are light."""
+    even = torch.full((KINDS,), 0.25).double()
+    mean = OWN.double()
+    covariance = 0.04 * torch.ones(3, 3).double().expand(KINDS, 3, 3)  # rough: things
+
+    def chroma(codes: Tensor) -> float:
+        d = build_dictionary([reference(OWN)], clusters=KINDS)._replace(colour_mean=codes)
+        maps, _ = light_maps(mean, covariance, even, torch.eye(KINDS).double(), d, even)
+        plants = mean[1] @ maps[1, :3] + maps[1, 3]
+        return float((plants.amax() - plants.amin()) / plants.mean())
+
+    own = float((OWN[1].amax() - OWN[1].amin()) / OWN[1].mean())
+    grey = OWN.mean(1, keepdim=True).expand(KINDS, 3)
+    road = torch.cat([grey[:1], OWN[1:2], grey[2:]])
+    assert chroma(road) > 0.9 * own
+    assert chroma(grey) < 0.6 * own
+
+
 def test_a_code_that_another_kind_claims_is_no_match_and_one_that_its_like_claims_is() -> None:
     """Without brick in the reference, brick takes the ground's code; two regions of one kind do not rob each
     other.
