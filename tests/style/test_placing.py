@@ -339,7 +339,8 @@ def test_shade_and_sun_on_things_of_one_kind_are_told_by_where_they_lie() -> Non
 
     def lit(points: Tensor | None) -> Tensor:
         measured = placed(pairs.semantic, None, points)
-        return pairs.own + measured.change(pairs.own) / measured.share
+        colours: Tensor = pairs.own + measured.change(pairs.own) / measured.share
+        return colours
 
     # Without places all take a mean of both; away from the edge, which likeness smooths over, each is its own.
     sure = (points - pairs.eye)[:, 0].abs() > 0.25
