@@ -1,8 +1,8 @@
 """Light where a reference shows the very place (`placing`): measured point by point, not carried over from
 things of the same kind.
 
-Letters: N points or pairs, D semantic channels, K regions of the scene, R references that show the place, J spots.
-Colours are sRGB in [0, 1].
+Letters: N points or pairs, D semantic channels, K regions of the scene, R references that show the place, J
+inducing pairs. Colours are sRGB in [0, 1].
 
 Two things are regressed on what tells points apart, their direction u in semantics, their membership m in regions
 and what they are near to, n: logarithms of the gains of all pairs of colours, channel by channel, and the colours
@@ -11,11 +11,12 @@ shown themselves,
     g(u, m, n)  =  exp(W u + V m + U n + b),        s(u, m, n)  =  W' u + V' m + U' n + b'
     c'  =  q ((c + o) g - o)  +  (1 - q) s
 
-n are J numbers whose products are the likeness of two points in semantics and direction t from the eye that sees
-what the photograph shows (`Spots`), exp(u u' - 1 + 5 (t t' - 1)): a wall in the shade and another in the sun
-take each the light that is shown beside them, and far from all pairs n is nothing.
+n are J Nystroem features (Williams and Seeger, NIPS 2000): their products are the likeness of two points in
+semantics and direction t from the eye that sees what the photograph shows, exp(u u' - 1 + 5 (t t' - 1)), as far as
+J of the pairs tell it (`InducingPairs`). A wall in the shade and another in the sun take each the light that is
+shown beside them, and far from all pairs n is nothing.
 
-where q follows the slope of the colours shown on the colours by gain, both less s, over the pairs of a region, in
+q follows the slope of the colours shown on the colours by gain, both less s, over the pairs of a region, in
 [0, 1]: 1 where the scene's own colours say what the photograph shows; 0 in a sky, whose clouds are others. Where
 views and photograph do not quite lie on each other the slope is small, too, but things keep their contrast: of what
 is missing to 1 they take half. Things are rough, in the scene and in the photograph. Pairs whose semantics differ
@@ -53,10 +54,10 @@ _THING_CONTRAST = 0.5
 """
 _DIRECTION_WEIGHT = 5.0
 """Weight of the cosine of directions beside that of semantics: likeness falls to 0.6 at 26 degrees."""
-_SPOTS = 128
+_INDUCING_PAIRS = 128
 """Pairs, in even steps through all, that points are near to, at most."""
-_SPOT_RIDGE = 1e-4
-"""Added to the likeness of spots with themselves, 1: a hundredth squared."""
+_INDUCING_RIDGE = 1e-4
+"""Added to the likeness of these with themselves, 1: a hundredth squared."""
 _APPLIED = 0.85
 """Share of a look that is measured where pairs are many: the rest is matched, and errs elsewhere."""
 _MIN_SURE_PAIRS = 2.0
@@ -86,20 +87,20 @@ class Measured(NamedTuple):
         return torch.cat([torch.diag_embed(self.excess), self.offset[:, None]], 1)
 
 
-class Spots(nn.Module):
-    """What points are near to among the pairs of one photograph: in semantics, and as its eye sees them."""
+class InducingPairs(nn.Module):
+    """Pairs of one photograph that others are compared with, in semantics and as its eye sees them."""
 
     keys: Annotated[Tensor, "J D+3"]
     """Directions in semantics, and weighted ones in the world, side by side."""
     root: Annotated[Tensor, "J J"]
-    """Likenesses with the spots times this are n."""
+    """Likenesses with these pairs times this are n."""
     eye: Annotated[Tensor, "3"]
 
     def __init__(self, pairs: Pairs, centre: Annotated[Tensor, "D"]) -> None:
         super().__init__()
-        some = slice(0, None, -(-len(pairs.own) // _SPOTS))
+        some = slice(0, None, -(-len(pairs.own) // _INDUCING_PAIRS))
         keys = _beside(double(unit(pairs.semantic[some].to(centre), centre)), double(pairs.toward[some]))
-        same = _likeness(keys, keys) + _SPOT_RIDGE * torch.eye(len(keys)).to(keys)
+        same = _likeness(keys, keys) + _INDUCING_RIDGE * torch.eye(len(keys)).to(keys)
         upper = torch.linalg.cholesky(same).T
         self.register_buffer("keys", keys.float())
         self.register_buffer("root", torch.linalg.inv(upper).float())
@@ -108,7 +109,7 @@ class Spots(nn.Module):
     def forward(
         self, direction: Annotated[Tensor, "N D"], toward: Annotated[Tensor, "N 3"]
     ) -> Annotated[Tensor, "N J"]:
-        """Likenesses of points with the spots, in [0, 1], by directions in semantics and from the eye."""
+        """Likenesses of points with these pairs, in [0, 1], by directions in semantics and from the eye."""
         return _likeness(_beside(direction, toward.to(direction)), self.keys.to(direction))
 
     def seen(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
@@ -145,12 +146,16 @@ class PlacedLight(nn.Module):
     """Share of each reference's light that a region takes; rows sum to 1 at most."""
 
     def __init__(
-        self, scene: SceneStyle, fits: Sequence[Fit], spots: Sequence[Spots], trust: Annotated[Tensor, "K R"]
+        self,
+        scene: SceneStyle,
+        fits: Sequence[Fit],
+        inducing: Sequence[InducingPairs],
+        trust: Annotated[Tensor, "K R"],
     ) -> None:
         super().__init__()
         self.membership = Membership(scene.keys, scene.semantic_mean)
-        self.spots = nn.ModuleList(spots)
-        for r, (each, near) in enumerate(zip(fits, spots, strict=True)):
+        self.inducing = nn.ModuleList(inducing)
+        for r, (each, near) in enumerate(zip(fits, inducing, strict=True)):
             # Gains and colours side by side, and coefficients of likenesses in the place of those of n.
             table = torch.cat([each.gains, each.colours], 1)
             count = len(table) - len(near.keys)
@@ -182,9 +187,9 @@ class PlacedLight(nn.Module):
             table: Tensor = getattr(self, f"coefficients{r}")
             both = what @ table[: what.shape[1]]
             if points is not None:
-                spots = self.spots[r]
-                assert isinstance(spots, Spots)  # nn.ModuleList forgets it
-                both = both + spots(direction, spots.seen(points)) @ table[what.shape[1] :]
+                inducing = self.inducing[r]
+                assert isinstance(inducing, InducingPairs)  # nn.ModuleList forgets it
+                both = both + inducing(direction, inducing.seen(points)) @ table[what.shape[1] :]
             gain = _gain(both[:, :3])
             excess = excess + share * (slope * gain - 1)
             shown = both[:, 3:].clamp(0, 1)
@@ -280,20 +285,20 @@ def placed_light(
     membership = Membership(scene.keys, scene.semantic_mean)
     source = sources(*(double(part).cpu() for part in colours))
     fits = []
-    spots = []
+    inducing = []
     trust = []
     for i, pairs in enumerate(dictionary.placed):
         if pairs is not None:
             belongs = membership(pairs.semantic)
             what = _described(pairs.semantic.to(belongs), belongs, membership.centre)
-            near = Spots(pairs, membership.centre)
+            near = InducingPairs(pairs, membership.centre)
             n = near(what[:, : pairs.semantic.shape[1]], pairs.toward) @ near.root.to(what)
             fits.append(fit(pairs, what, n, belongs, source))
-            spots.append(near)
+            inducing.append(near)
             trust.append(_APPLIED * odds[:, i] * _support(pairs, belongs))
     if not fits:
         return None
-    return PlacedLight(scene, fits, spots, torch.stack(trust, 1))
+    return PlacedLight(scene, fits, inducing, torch.stack(trust, 1))
 
 
 def _support(pairs: Pairs, belongs: Annotated[Tensor, "N K"]) -> Annotated[Tensor, "K"]:

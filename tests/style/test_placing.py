@@ -26,7 +26,7 @@ from fprf.style.files import StyleFile
 from fprf.style.light import BLACK_OFFSET
 from fprf.style.look import Restyle
 from fprf.style.matching import unit
-from fprf.style.placed_light import PlacedLight, Spots, fit, placed_light
+from fprf.style.placed_light import InducingPairs, PlacedLight, fit, placed_light
 from fprf.style.placing import (
     Keypoints,
     Landmarks,
@@ -352,17 +352,17 @@ def test_shade_and_sun_on_things_of_one_kind_are_told_by_where_they_lie() -> Non
 
 
 def test_what_points_are_near_to_has_their_likeness_for_a_product() -> None:
-    """n of two spots, multiplied, against the formula in float64."""
+    """n of two points, multiplied, against the formula in float64."""
     _, scene, pairs = sunny_and_shaded()
     centre = scene.semantic_mean
-    spots = Spots(pairs, centre)
+    inducing = InducingPairs(pairs, centre)
     some = slice(0, None, 8)
-    assert len(spots.keys) == 125
+    assert len(inducing.keys) == 125
     direction = unit(pairs.semantic[some], centre).double()
     toward = pairs.toward[some].double()
-    n = spots(direction, toward) @ spots.root.double()
+    n = inducing(direction, toward) @ inducing.root.double()
     wanted = (direction @ direction.T + 5 * (toward @ toward.T) - 6).exp()
-    # The ridge of 1e-4 takes as much of each spot's own; roots in float32 are of matrices of a condition of 1e6.
+    # The ridge of 1e-4 takes as much of each pair's own; roots in float32 are of matrices of a condition of 1e6.
     assert float((n @ n.T - wanted).abs().max()) < 2e-3
 
 
