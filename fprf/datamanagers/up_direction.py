@@ -220,7 +220,7 @@ class _Travel(NamedTuple):
 
 
 def _travel(scene: ParsedScene, alike: _Alike) -> _Travel | None:
-    """How far cameras move; None where no points say how far away things are, or where they move ahead."""
+    """Travel of the cameras; None where no points say how far away things are, or where they move ahead."""
     if scene.points is None or not len(scene.points):
         return None
     cameras = scene.cameras.select(

@@ -45,7 +45,7 @@ class CaptureAxes:
     path: Path
     up: Direction
     reason: str
-    """What tells it, in words."""
+    """Words for what the direction was found from."""
     said: bool = False
     """The file says it, or a flag."""
     told: bool = True
@@ -115,7 +115,7 @@ class JoinedWorld(NamedTuple):
     up_reason: str
     north: North | None
     notes: tuple[str, ...]
-    """What each was taken for that differs from the first, as a line each."""
+    """A line for each that differs from the first: for what it was taken."""
 
 
 def axes_of(capture: Capture, asked: Direction | None = None) -> CaptureAxes:

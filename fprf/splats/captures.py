@@ -390,7 +390,7 @@ def _read(path: Path, look: LookConfig, say: Callable[[str], None]) -> Capture:
 
 
 def _joined(parts: Sequence[Gaussians], placements: Sequence[Placement]) -> Gaussians:
-    """All Gaussians of several, each in its place, with as many harmonics as the most of them have."""
+    """Gaussians of several captures, each in its place, with as many harmonics as the most of them have."""
     bands = max(part.harmonics.shape[1] for part in parts)
     harmonics = []
     placed = []

@@ -307,5 +307,5 @@ def _support(pairs: Pairs, belongs: Annotated[Tensor, "N K"]) -> Annotated[Tenso
 
 
 def _sure(count: Annotated[Tensor, "K"]) -> Annotated[Tensor, "K"]:
-    """How far so many pairs are believed, in [0, 1)."""
+    """Belief in so many pairs, in [0, 1)."""
     return count / (count + _MIN_SURE_PAIRS)

@@ -101,7 +101,7 @@ class ViewSamples(NamedTuple):
     semantic: Annotated[Tensor, "M D"]
     """In the scene's basis."""
     eye: Annotated[Tensor, "3"]
-    """Where the view is seen from, world units."""
+    """Position of the camera, world units."""
     rays: Callable[[Annotated[Tensor, "N 2"]], Annotated[Tensor, "N 3"]]
     """Unit directions in the world through pixels, inside of the view or beyond."""
 
@@ -128,13 +128,13 @@ class Pairs(NamedTuple):
     agreeing: int
     """Matches that agree in the best view."""
     eye: Annotated[Tensor, "3"]
-    """Where the best view is seen from, world units."""
+    """Position of the camera of the best view, world units."""
     toward: Annotated[Tensor, "N 3"]
     """Unit directions from there."""
     pixel: Annotated[Tensor, "N 2"]
-    """Where in the photograph (x, y, int64)."""
+    """Pixels of the photograph (x, y, int64)."""
     weight: Annotated[Tensor, "N"]
-    """How far the photograph shows there what the scene has, and nothing that stands before it, in [0, 1]."""
+    """Likeness of what the photograph shows there to what the scene has, in [0, 1]; 0 of something else before it."""
 
 
 class Registration(NamedTuple):
