@@ -9,6 +9,7 @@ nearest neighbours by Lowe's ratio; the map is found by RANSAC (Fischler and Bol
 refined to an affine one. Of 5348 pairs of unrelated photographs 7 matches agree at most.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, NamedTuple
 
@@ -225,10 +226,9 @@ def register(
     )
     if similar is None or int(agrees.sum()) < least:
         return None
-    scale = float(abs(np.linalg.det(similar[:, :2])) ** 0.5)
-    if not 1 / _MAX_SCALE < scale < _MAX_SCALE:
-        return None
     best = torch.from_numpy(np.asarray(similar, dtype=np.float64))
+    if not _sound(best):
+        return None
     agreeing = int(agrees.sum())
     # A façade is seen from another side: six numbers instead of four, where they hold for as many matches.
     near = torch.from_numpy(agrees[:, 0] > 0)
@@ -236,12 +236,19 @@ def register(
     for _ in range(_REFINEMENTS):
         matrix = torch.linalg.lstsq(x[near], b[near].double(), driver="gelsd").solution.T
         near = (x @ matrix.T - b.double()).norm(dim=1) < tolerance
-        if int(near.sum()) < agreeing:
+        # Matches along a line say nothing of the scale across it.
+        if int(near.sum()) < agreeing or not _sound(matrix):
             break
         best = matrix
         agreeing = int(near.sum())
     landed = _within(x @ best.T, size)
     return Registration(best, agreeing, agreeing / max(1, int(landed.sum())))
+
+
+def _sound(matrix: Annotated[Tensor, "2 3"]) -> bool:
+    """True for an affine map of a scale in the range of scales; it has an inverse then."""
+    scale = math.sqrt(abs(float(torch.linalg.det(matrix[:, :2]))))
+    return 1 / _MAX_SCALE < scale < _MAX_SCALE
 
 
 def _within(at: Annotated[Tensor, "N 2"], size: tuple[int, int]) -> Annotated[Tensor, "N"]:
@@ -291,15 +298,15 @@ def find_place(
     return Pairs(own, shown, semantic, found[0][0].agreeing, best.eye, best.rays(pixel), at.long(), ones)
 
 
-def weighed(pairs: Pairs, there: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Pairs:
+def weighed(pairs: Pairs, there: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Pairs | None:
     """The pairs, each by how alike semantics of the scene and of the photograph are: `there` at their pixels, `centre` is
-    that of the scene's.
+    that of the scene's. None where nothing is alike.
 
     A branch before the sky, people on stairs and all else that only the photograph has are seen by that.
     """
     alike = (unit(pairs.semantic, centre) * unit(there.to(pairs.semantic), centre)).sum(1)
     weight = (alike - _MAX_OTHER_COSINE) / (_MIN_SAME_COSINE - _MAX_OTHER_COSINE)
-    return pairs._replace(weight=weight.clamp(0, 1))
+    return pairs._replace(weight=weight.clamp(0, 1)) if bool((weight > 0).any()) else None
 
 
 def _registered(

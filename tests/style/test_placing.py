@@ -38,6 +38,7 @@ from fprf.style.placing import (
     find_place,
     keypoint_tensors,
     keypoints_from,
+    register,
     view_keypoints,
     weighed,
 )
@@ -227,6 +228,7 @@ def test_what_stands_before_a_thing_does_not_light_it() -> None:
     sky = torch.eye(4)[0].expand(400, 4)
     there = torch.where(branch[:, None], torch.eye(4)[1], sky)
     told = weighed(pairs_of(own, shown, sky), there, torch.zeros(4))
+    assert told is not None
     assert told.weight.tolist() == (~branch).float().tolist()
     what = torch.ones(400, 1)
     found = fit(told, what, what[:, :0], torch.ones(400, 1), torch.ones(1))
@@ -240,6 +242,18 @@ def test_what_stands_before_a_thing_does_not_light_it() -> None:
         told._replace(weight=torch.zeros(400)), what, what[:, :0], torch.ones(400, 1), torch.ones(1)
     )
     assert float(nothing.gains.abs().max()) == 0 and float(nothing.slopes) == 1
+    assert weighed(pairs_of(own, shown, sky), -sky, torch.zeros(4)) is None, "nor recognised"
+
+
+def test_matches_along_a_line_keep_the_map_that_has_an_inverse() -> None:
+    """A horizon: least squares alone would shrink what lies across it to a hundredth."""
+    x = torch.linspace(5, 155, 40)
+    a = torch.stack([x, torch.full_like(x, 60.0)], 1)
+    b = torch.stack([0.9 * x + 3, torch.full_like(x, 0.5)], 1)
+    known = register(a, b, (160, 120), 10)
+    assert known is not None and known.agreeing == 40
+    # The turn is none and the scale is 0.9 both ways, as along the line.
+    assert torch.allclose(known.matrix[:, :2], 0.9 * torch.eye(2).double(), atol=1e-3)
 
 
 def scene_of(count: int = 400) -> tuple[Tensor, Tensor, SceneStyle]:
